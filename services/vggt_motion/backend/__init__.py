@@ -1,0 +1,1 @@
+"""Planner, pose graph, trajectory and map (paper section 3.3)."""

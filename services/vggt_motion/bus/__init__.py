@@ -1,0 +1,1 @@
+"""Everything Zenoh: nothing outside this package imports zenoh (``sources/zenoh.py`` excepted)."""

@@ -1,0 +1,231 @@
+"""The configuration of a run: one tree of pydantic models, units in the names, dumped beside every result.
+
+Values come from the defaults here, then a YAML file (``--config``), then environment variables
+(``VGGT_MOTION_BUS__ENDPOINT=...``), then ``--set section.field=value``; later ones win. Unknown names are errors.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vggt_motion.errors import ConfigurationError
+
+_ENVIRONMENT_PREFIX = "VGGT_MOTION_"
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, unknown names refused, defaults checked."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class BusConfig(Section):
+    """How a process joins the bus."""
+
+    endpoint: str = Field("tcp/127.0.0.1:7447", description="Zenoh endpoint of the router")
+    session: str = Field("default", pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the session, part of every key")
+    lease_s: float = Field(3.0, gt=0.1, description="link lease: a frozen peer is gone after this")
+    connect_timeout_s: float = Field(10.0, gt=0, description="how long to try to reach the router before giving up")
+    request_timeout_s: float = Field(10.0, gt=0, description="how long one acknowledged request may take")
+    shared_memory: bool = Field(False, description="explicit single-host switch; has hazards, see the documentation")
+    zenoh_config: Path | None = Field(None, description="JSON5 file merged under ours (TLS, authentication)")
+
+
+class LedgerConfig(Section):
+    """The durable log and the job queue."""
+
+    reserve_bytes: int = Field(256 * 2**20, ge=0, description="below this much free disk new keyframes are refused")
+    lease_duration_s: float = Field(10.0, gt=0, description="a job whose worker sent no heartbeat for so long is open again")
+    max_failures: int = Field(3, ge=1, description="failures that workers report until a job is dead")
+    max_lost_leases: int = Field(10, ge=1, description="lost leases until a job is dead")
+    retry_backoff_s: float = Field(0.5, ge=0, description="a failed job waits this long, doubled each time")
+
+
+class FrontendConfig(Section):
+    """Motion state, keyframes and partition (paper section 3.1, DESIGN 3.1 and 3.2)."""
+
+    flow_width_px: int = Field(320, ge=64, le=2048, description="working width; the pixel thresholds below are taken at 320 px and scale with it")
+    static_flow_px: float = Field(0.7, gt=0, description="tau_flow: below it a pixel is quasi-static")
+    static_ratio: float = Field(0.9, gt=0, le=1, description="tau_static: share of quasi-static pixels of a standing camera")
+    turning_score: Literal["yaw", "lateral"] = Field("yaw", description="signed common shift, or the paper's mean |fx|")
+    turning_flow_px: float = Field(1.4, gt=0, description="tau_turn for the chosen score")
+    smoothing_sigma_frames: float = Field(2.0, ge=0, description="Gaussian smoothing of the scores")
+    smoothing_lookahead_frames: int = Field(4, ge=0, description="frames after the present one that smoothing may see")
+    selection: Literal["dense", "uniform", "covisibility", "parallax"] = "parallax"
+    static_pruning: bool = True
+    parallax_px: float = Field(15.0, gt=0, description="tau_palx: median flow since the last keyframe")
+    uniform_stride: int = Field(3, ge=1, description="for selection = uniform")
+    covisibility_ratio: float = Field(0.7, gt=0, lt=1, description="for selection = covisibility: below it a new keyframe")
+    partition: Literal["temporal", "parallax", "topology"] = "topology"
+    max_keyframes: int = Field(12, ge=2, description="N_max: base keyframes of a submap without a turn")
+    overlap_keyframes: int = Field(5, ge=1, description="N_ovlp")
+    turn_max_keyframes: int = Field(36, ge=2, description="base keyframes at which even a turn is cut")
+    partition_parallax_px: float = Field(180.0, gt=0, description="for partition = parallax: cumulative parallax of a submap")
+
+    @model_validator(mode="after")
+    def _orders(self) -> FrontendConfig:
+        if self.overlap_keyframes >= self.max_keyframes:
+            raise ValueError("overlap_keyframes must be smaller than max_keyframes")
+        if self.turn_max_keyframes < self.max_keyframes:
+            raise ValueError("turn_max_keyframes must not be smaller than max_keyframes")
+        return self
+
+
+class SfmConfig(Section):
+    """The default predictor."""
+
+    width_px: int = Field(620, ge=160, le=4096, description="images wider than this are reduced to it for tracking")
+    depth_width_px: int = Field(310, ge=80, le=2048, description="width of the dense depth maps")
+    seed: int = Field(0, ge=0)
+
+
+class InferenceConfig(Section):
+    """The predictor and its worker."""
+
+    predictor: str = "sfm"
+    focal_over_width: float | None = Field(None, gt=0.1, lt=20, description="known focal length / image width; None = self-calibrate")
+    radial_k1: float | None = Field(None, ge=-1, le=1, description="known radial coefficient")
+    job_deadline_s: float = Field(300.0, gt=0, description="a prediction that takes longer is ended and reported as failed")
+    sfm: SfmConfig = SfmConfig()
+
+
+class RegistrationConfig(Section):
+    """Sim(3) constraints (paper section 3.2, DESIGN 3.5)."""
+
+    anchor: Literal["window1", "window3", "window5", "full"] = "window1"
+    confidence_mode: Literal["quantile", "mean_coef", "median_coef", "absolute"] = "quantile"
+    confidence_value: float = Field(0.5, ge=0, description="tau_conf in the chosen mode")
+    huber_relative: float = Field(0.02, gt=0, description="Huber width on depth-relative residuals")
+    inlier_relative: float = Field(0.05, gt=0, description="inlier radius on depth-relative residuals")
+    max_iterations: int = Field(20, ge=1)
+    min_inlier_ratio: float = Field(0.5, ge=0, le=1, description="tau_in: below it the edge is dropped")
+    min_points: int = Field(500, ge=3)
+    job_deadline_s: float = Field(60.0, gt=0)
+
+
+class LoopsConfig(Section):
+    """Loop composition (DESIGN 3.3)."""
+
+    enabled: bool = False
+
+
+class BackendConfig(Section):
+    """Pose graph and map."""
+
+    huber_sigma: float = Field(1.345, gt=0, description="Huber width in standard deviations")
+    solve_deadline_s: float = Field(120.0, gt=0)
+    map_confidence: float = Field(0.5, ge=0, le=1, description="points below this confidence stay out of the map")
+    map_voxel_over_step: float = Field(0.1, ge=0, description="voxel edge as a share of the median keyframe distance; 0 = none")
+    map_max_points: int = Field(2_000_000, ge=1000)
+    known_distance_m: float | None = Field(None, gt=0, description="known travelled distance: sets the scale")
+
+
+class GatewayConfig(Section):
+    """The HTTP gateway."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(8000, ge=0, le=65535, description="0 = any free port")
+    token: str | None = Field(None, min_length=16, description="bearer token; needed for any address but loopback")
+
+
+class RecorderConfig(Section):
+    """The MCAP recorder."""
+
+    enabled: bool = True
+    flush_interval_s: float = Field(1.0, gt=0, description="at most this much of the recording is lost with the process")
+    chunk_bytes: int = Field(4 * 2**20, ge=1024)
+
+
+class RunConfig(Section):
+    """The local processes of ``vggt-motion run``."""
+
+    inference_workers: int = Field(1, ge=1, le=64)
+    registration_workers: int = Field(1, ge=1, le=64)
+    camera: str = Field("front", pattern=r"^[A-Za-z0-9_.-]{1,64}$")
+
+
+class Config(Section):
+    """Everything that a run can be told."""
+
+    bus: BusConfig = BusConfig()
+    ledger: LedgerConfig = LedgerConfig()
+    frontend: FrontendConfig = FrontendConfig()
+    inference: InferenceConfig = InferenceConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    loops: LoopsConfig = LoopsConfig()
+    backend: BackendConfig = BackendConfig()
+    gateway: GatewayConfig = GatewayConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    run: RunConfig = RunConfig()
+
+    def to_yaml(self) -> str:
+        """The effective configuration as YAML that :func:`load_config` reads back to an equal one; the token is left out."""
+        data = self.model_dump(mode="json", exclude={"gateway": {"token"}})
+        text: str = yaml.safe_dump(data, sort_keys=False)
+        return text
+
+
+def load_config(
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+) -> Config:
+    """Build the effective configuration.
+
+    Args:
+        file: YAML file with any part of the tree.
+        assignments: ``section.field=value`` strings; the value is read as YAML.
+        environment: defaults to the process environment; names ``VGGT_MOTION_SECTION__FIELD``.
+
+    Raises:
+        ConfigurationError: one line that names the offending place.
+    """
+    data: dict[str, Any] = {}
+    if file is not None:
+        try:
+            loaded = yaml.safe_load(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigurationError(f"cannot read configuration {file}: {error.strerror or error}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ConfigurationError(f"configuration {file} is not YAML: {' '.join(str(error).split())}") from error
+        if loaded is not None and not isinstance(loaded, dict):
+            raise ConfigurationError(f"configuration {file} must be a mapping of sections")
+        data = loaded or {}
+    for name, text in sorted((os.environ if environment is None else environment).items()):
+        if name.startswith(_ENVIRONMENT_PREFIX) and "__" in name:
+            _assign(data, name[len(_ENVIRONMENT_PREFIX) :].lower().split("__"), _scalar(text), name)
+    for assignment in assignments:
+        path, separator, text = assignment.partition("=")
+        if not separator or not path:
+            raise ConfigurationError(f"'{assignment}' is not of the form section.field=value")
+        _assign(data, path.split("."), _scalar(text), assignment)
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "configuration"
+        raise ConfigurationError(f"{place}: {first['msg']}") from error
+
+
+def _scalar(text: str) -> Any:
+    # YAML 1.1 reads 1e-9 as a string; pydantic turns such a string into the number that the field wants.
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f"'{text}' is not a value: {' '.join(str(error).split())}") from error
+
+
+def _assign(data: dict[str, Any], path: Sequence[str], value: Any, origin: str) -> None:
+    node = data
+    for part in path[:-1]:
+        child = node.setdefault(part, {})
+        if not isinstance(child, dict):
+            raise ConfigurationError(f"'{origin}': {part} is not a section")
+        node = child
+    node[path[-1]] = value

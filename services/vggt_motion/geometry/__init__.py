@@ -1,0 +1,1 @@
+"""Rigid and similarity transforms, projection and point maps: numpy only, no state, no input or output."""

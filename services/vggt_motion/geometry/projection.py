@@ -1,0 +1,78 @@
+"""The camera model: pinhole with one radial coefficient, on the lattice of the image that was recorded.
+
+OpenCV axes (x right, y down, z forward). Pixel centres lie at whole numbers: the top left pixel is (0, 0). With normalised ray
+``(x, y) = (X/Z, Y/Z)`` and ``r2 = x*x + y*y`` a point is seen at ``u = fx * x * (1 + k1 * r2) + cx`` and ``v`` likewise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+_UNDISTORT_ITERATIONS = 12
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Focal lengths and principal point in pixels of an image of ``width_px`` x ``height_px``; ``k1`` has no unit."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width_px: int
+    height_px: int
+    k1: float = 0.0
+
+    @staticmethod
+    def centred(focal_px: float, width_px: int, height_px: int, k1: float = 0.0) -> Intrinsics:
+        """Square pixels and the principal point in the middle of the image."""
+        return Intrinsics(focal_px, focal_px, 0.5 * (width_px - 1), 0.5 * (height_px - 1), width_px, height_px, k1)
+
+    def resized(self, width_px: int, height_px: int) -> Intrinsics:
+        """The same camera on the image resized to ``width_px`` x ``height_px`` (areas of pixels aligned, as cv2.resize does)."""
+        sx, sy = width_px / self.width_px, height_px / self.height_px
+        return Intrinsics(
+            self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width_px, height_px, self.k1
+        )
+
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """The (3, 3) pinhole matrix, without distortion."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+def undistort_rays(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], k1: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Normalised coordinates without distortion from distorted ones, by Newton's method on the radius."""
+    if k1 == 0.0:
+        return x, y
+    distorted_radius = np.hypot(x, y)
+    radius = distorted_radius.copy()
+    for _ in range(_UNDISTORT_ITERATIONS):
+        slope = np.maximum(1.0 + 3.0 * k1 * radius**2, 0.1)
+        radius -= (radius * (1.0 + k1 * radius**2) - distorted_radius) / slope
+    factor = np.where(distorted_radius > 1e-12, radius / np.maximum(distorted_radius, 1e-12), 1.0)
+    return x * factor, y * factor
+
+
+def pixel_rays(intrinsics: Intrinsics) -> npt.NDArray[np.float64]:
+    """Rays (H, W, 3) of all pixels in the camera frame, scaled so that z is 1."""
+    u, v = np.meshgrid(np.arange(intrinsics.width_px, dtype=np.float64), np.arange(intrinsics.height_px, dtype=np.float64))
+    x, y = undistort_rays((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, intrinsics.k1)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def unproject(depth: npt.NDArray[np.floating], intrinsics: Intrinsics) -> npt.NDArray[np.float64]:
+    """Point map (H, W, 3) in the camera frame of a depth map (H, W) along the optical axis, same unit."""
+    return pixel_rays(intrinsics) * np.asarray(depth, dtype=np.float64)[..., None]
+
+
+def project(points_camera: npt.NDArray[np.floating], intrinsics: Intrinsics) -> npt.NDArray[np.float64]:
+    """Pixels (..., 2) of points (..., 3) in the camera frame; NaN where the point is not in front of the camera."""
+    points = np.asarray(points_camera, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
+        x, y = points[..., 0] / z, points[..., 1] / z
+        factor = 1.0 + intrinsics.k1 * (x * x + y * y)
+    return np.stack([intrinsics.fx * x * factor + intrinsics.cx, intrinsics.fy * y * factor + intrinsics.cy], axis=-1)

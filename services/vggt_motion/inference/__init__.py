@@ -1,0 +1,1 @@
+"""Geometry prediction: the predictor contract, the predictors behind it, and the inference worker."""

@@ -1,0 +1,1 @@
+"""The durable log and the job queue; knows nothing of SLAM."""

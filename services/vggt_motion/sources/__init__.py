@@ -1,0 +1,1 @@
+"""Frames in: one file per kind of source, one registry."""
