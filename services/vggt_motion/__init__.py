@@ -1,4 +1,4 @@
-"""VGGT-Motion: a globally consistent trajectory and dense map from uncalibrated monocular video, as services over Zenoh."""
+"""VGGT-Motion: a consistent trajectory and dense map from uncalibrated monocular video, as services over Zenoh."""
 
 from importlib.metadata import PackageNotFoundError, version
 

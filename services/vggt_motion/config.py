@@ -6,17 +6,21 @@ Values come from the defaults here, then a YAML file (``--config``), then enviro
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    InitSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
 
 from vggt_motion.errors import ConfigurationError
-
-_ENVIRONMENT_PREFIX = "VGGT_MOTION_"
 
 
 class Section(BaseModel):
@@ -29,7 +33,9 @@ class BusConfig(Section):
     """How a process joins the bus."""
 
     endpoint: str = Field("tcp/127.0.0.1:7447", description="Zenoh endpoint of the router")
-    session: str = Field("default", pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the session, part of every key")
+    session: str = Field(
+        "default", pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the session, part of every key"
+    )
     lease_s: float = Field(3.0, gt=0.1, description="link lease: a frozen peer is gone after this")
     connect_timeout_s: float = Field(10.0, gt=0, description="how long to try to reach the router before giving up")
     request_timeout_s: float = Field(10.0, gt=0, description="how long one acknowledged request may take")
@@ -41,7 +47,9 @@ class LedgerConfig(Section):
     """The durable log and the job queue."""
 
     reserve_bytes: int = Field(256 * 2**20, ge=0, description="below this much free disk new keyframes are refused")
-    lease_duration_s: float = Field(10.0, gt=0, description="a job whose worker sent no heartbeat for so long is open again")
+    lease_duration_s: float = Field(
+        10.0, gt=0, description="a job whose worker sent no heartbeat for so long is open again"
+    )
     max_failures: int = Field(3, ge=1, description="failures that workers report until a job is dead")
     max_lost_leases: int = Field(10, ge=1, description="lost leases until a job is dead")
     retry_backoff_s: float = Field(0.5, ge=0, description="a failed job waits this long, doubled each time")
@@ -50,9 +58,16 @@ class LedgerConfig(Section):
 class FrontendConfig(Section):
     """Motion state, keyframes and partition (paper section 3.1, DESIGN 3.1 and 3.2)."""
 
-    flow_width_px: int = Field(320, ge=64, le=2048, description="working width; the pixel thresholds below are taken at 320 px and scale with it")
+    flow_width_px: int = Field(
+        320,
+        ge=64,
+        le=2048,
+        description="working width; the pixel thresholds below are taken at 320 px and scale with it",
+    )
     static_flow_px: float = Field(0.7, gt=0, description="tau_flow: below it a pixel is quasi-static")
-    static_ratio: float = Field(0.9, gt=0, le=1, description="tau_static: share of quasi-static pixels of a standing camera")
+    static_ratio: float = Field(
+        0.9, gt=0, le=1, description="tau_static: share of quasi-static pixels of a standing camera"
+    )
     turning_score: Literal["yaw", "lateral"] = Field("yaw", description="signed common shift, or the paper's mean |fx|")
     turning_flow_px: float = Field(1.4, gt=0, description="tau_turn for the chosen score")
     smoothing_sigma_frames: float = Field(2.0, ge=0, description="Gaussian smoothing of the scores")
@@ -61,12 +76,16 @@ class FrontendConfig(Section):
     static_pruning: bool = True
     parallax_px: float = Field(15.0, gt=0, description="tau_palx: median flow since the last keyframe")
     uniform_stride: int = Field(3, ge=1, description="for selection = uniform")
-    covisibility_ratio: float = Field(0.7, gt=0, lt=1, description="for selection = covisibility: below it a new keyframe")
+    covisibility_ratio: float = Field(
+        0.7, gt=0, lt=1, description="for selection = covisibility: below it a new keyframe"
+    )
     partition: Literal["temporal", "parallax", "topology"] = "topology"
     max_keyframes: int = Field(12, ge=2, description="N_max: base keyframes of a submap without a turn")
     overlap_keyframes: int = Field(5, ge=1, description="N_ovlp")
     turn_max_keyframes: int = Field(36, ge=2, description="base keyframes at which even a turn is cut")
-    partition_parallax_px: float = Field(180.0, gt=0, description="for partition = parallax: cumulative parallax of a submap")
+    partition_parallax_px: float = Field(
+        180.0, gt=0, description="for partition = parallax: cumulative parallax of a submap"
+    )
 
     @model_validator(mode="after")
     def _orders(self) -> FrontendConfig:
@@ -89,9 +108,13 @@ class InferenceConfig(Section):
     """The predictor and its worker."""
 
     predictor: str = "sfm"
-    focal_over_width: float | None = Field(None, gt=0.1, lt=20, description="known focal length / image width; None = self-calibrate")
+    focal_over_width: float | None = Field(
+        None, gt=0.1, lt=20, description="known focal length / image width; None = self-calibrate"
+    )
     radial_k1: float | None = Field(None, ge=-1, le=1, description="known radial coefficient")
-    job_deadline_s: float = Field(300.0, gt=0, description="a prediction that takes longer is ended and reported as failed")
+    job_deadline_s: float = Field(
+        300.0, gt=0, description="a prediction that takes longer is ended and reported as failed"
+    )
     sfm: SfmConfig = SfmConfig()
 
 
@@ -121,7 +144,9 @@ class BackendConfig(Section):
     huber_sigma: float = Field(1.345, gt=0, description="Huber width in standard deviations")
     solve_deadline_s: float = Field(120.0, gt=0)
     map_confidence: float = Field(0.5, ge=0, le=1, description="points below this confidence stay out of the map")
-    map_voxel_over_step: float = Field(0.1, ge=0, description="voxel edge as a share of the median keyframe distance; 0 = none")
+    map_voxel_over_step: float = Field(
+        0.1, ge=0, description="voxel edge as a share of the median keyframe distance; 0 = none"
+    )
     map_max_points: int = Field(2_000_000, ge=1000)
     known_distance_m: float | None = Field(None, gt=0, description="known travelled distance: sets the scale")
 
@@ -138,7 +163,9 @@ class RecorderConfig(Section):
     """The MCAP recorder."""
 
     enabled: bool = True
-    flush_interval_s: float = Field(1.0, gt=0, description="at most this much of the recording is lost with the process")
+    flush_interval_s: float = Field(
+        1.0, gt=0, description="at most this much of the recording is lost with the process"
+    )
     chunk_bytes: int = Field(4 * 2**20, ge=1024)
 
 
@@ -150,8 +177,16 @@ class RunConfig(Section):
     camera: str = Field("front", pattern=r"^[A-Za-z0-9_.-]{1,64}$")
 
 
-class Config(Section):
+class Config(BaseSettings):
     """Everything that a run can be told."""
+
+    model_config = SettingsConfigDict(
+        frozen=True,
+        extra="forbid",
+        validate_default=True,
+        env_prefix="VGGT_MOTION_",
+        env_nested_delimiter="__",
+    )
 
     bus: BusConfig = BusConfig()
     ledger: LedgerConfig = LedgerConfig()
@@ -165,52 +200,64 @@ class Config(Section):
     run: RunConfig = RunConfig()
 
     def to_yaml(self) -> str:
-        """The effective configuration as YAML that :func:`load_config` reads back to an equal one; the token is left out."""
+        """The effective configuration as YAML, read back by :func:`load_config` as an equal one; without the token."""
         data = self.model_dump(mode="json", exclude={"gateway": {"token"}})
         text: str = yaml.safe_dump(data, sort_keys=False)
         return text
 
 
-def load_config(
-    file: Path | None = None,
-    assignments: Sequence[str] = (),
-    environment: Mapping[str, str] | None = None,
-) -> Config:
+def load_config(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
     """Build the effective configuration.
 
     Args:
         file: YAML file with any part of the tree.
         assignments: ``section.field=value`` strings; the value is read as YAML.
-        environment: defaults to the process environment; names ``VGGT_MOTION_SECTION__FIELD``.
 
     Raises:
         ConfigurationError: one line that names the offending place.
     """
-    data: dict[str, Any] = {}
-    if file is not None:
-        try:
-            loaded = yaml.safe_load(file.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigurationError(f"cannot read configuration {file}: {error.strerror or error}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigurationError(f"configuration {file} is not YAML: {' '.join(str(error).split())}") from error
-        if loaded is not None and not isinstance(loaded, dict):
-            raise ConfigurationError(f"configuration {file} must be a mapping of sections")
-        data = loaded or {}
-    for name, text in sorted((os.environ if environment is None else environment).items()):
-        if name.startswith(_ENVIRONMENT_PREFIX) and "__" in name:
-            _assign(data, name[len(_ENVIRONMENT_PREFIX) :].lower().split("__"), _scalar(text), name)
+    from_file = _read_file(file) if file is not None else {}
+    from_command: dict[str, Any] = {}
     for assignment in assignments:
         path, separator, text = assignment.partition("=")
         if not separator or not path:
             raise ConfigurationError(f"'{assignment}' is not of the form section.field=value")
-        _assign(data, path.split("."), _scalar(text), assignment)
+        _assign(from_command, path.split("."), _scalar(text), assignment)
+
+    class _Layered(Config):
+        @classmethod
+        def settings_customise_sources(
+            cls,
+            settings_cls: type[BaseSettings],
+            init_settings: PydanticBaseSettingsSource,
+            env_settings: PydanticBaseSettingsSource,
+            dotenv_settings: PydanticBaseSettingsSource,
+            file_secret_settings: PydanticBaseSettingsSource,
+        ) -> tuple[PydanticBaseSettingsSource, ...]:
+            return init_settings, env_settings, InitSettingsSource(settings_cls, from_file)
+
     try:
-        return Config.model_validate(data)
+        layered = _Layered(**from_command)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "configuration"
         raise ConfigurationError(f"{place}: {first['msg']}") from error
+    except SettingsError as error:
+        raise ConfigurationError(f"environment: {error}") from error
+    # A plain Config from validated parts, so that equality and dumps do not depend on where the values came from.
+    return Config.model_construct(**{name: getattr(layered, name) for name in Config.model_fields})
+
+
+def _read_file(file: Path) -> dict[str, Any]:
+    try:
+        loaded = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"cannot read configuration {file}: {error.strerror or error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"configuration {file} is not YAML: {' '.join(str(error).split())}") from error
+    if loaded is not None and not isinstance(loaded, dict):
+        raise ConfigurationError(f"configuration {file} must be a mapping of sections")
+    return loaded or {}
 
 
 def _scalar(text: str) -> Any:

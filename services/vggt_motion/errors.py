@@ -1,7 +1,7 @@
 """The exceptions of the project, under one root.
 
-Every entry point (command line, HTTP, bus) turns a :class:`VggtMotionError` into one clear line and, on the command line,
-into the exit code that the class carries (DESIGN section 5). Anything else that escapes is a defect of ours.
+Every entry point (command line, HTTP, bus) turns a :class:`VggtMotionError` into one clear line and, on the command
+line, into the exit code that the class carries (DESIGN section 5). Anything else that escapes is a defect of ours.
 """
 
 from __future__ import annotations

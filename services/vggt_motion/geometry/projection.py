@@ -1,7 +1,8 @@
 """The camera model: pinhole with one radial coefficient, on the lattice of the image that was recorded.
 
-OpenCV axes (x right, y down, z forward). Pixel centres lie at whole numbers: the top left pixel is (0, 0). With normalised ray
-``(x, y) = (X/Z, Y/Z)`` and ``r2 = x*x + y*y`` a point is seen at ``u = fx * x * (1 + k1 * r2) + cx`` and ``v`` likewise.
+OpenCV axes (x right, y down, z forward). Pixel centres lie at whole numbers: the top left pixel is (0, 0). With the
+normalised ray ``(x, y) = (X/Z, Y/Z)`` and ``r2 = x*x + y*y`` a point is seen at ``u = fx * x * (1 + k1 * r2) + cx``,
+and ``v`` likewise.
 """
 
 from __future__ import annotations
@@ -32,10 +33,16 @@ class Intrinsics:
         return Intrinsics(focal_px, focal_px, 0.5 * (width_px - 1), 0.5 * (height_px - 1), width_px, height_px, k1)
 
     def resized(self, width_px: int, height_px: int) -> Intrinsics:
-        """The same camera on the image resized to ``width_px`` x ``height_px`` (areas of pixels aligned, as cv2.resize does)."""
+        """The same camera on the image resized to ``width_px`` x ``height_px`` (pixel areas aligned, as cv2.resize)."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return Intrinsics(
-            self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width_px, height_px, self.k1
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            width_px,
+            height_px,
+            self.k1,
         )
 
     def matrix(self) -> npt.NDArray[np.float64]:
@@ -43,7 +50,9 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
 
-def undistort_rays(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], k1: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def undistort_rays(
+    x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], k1: float
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Normalised coordinates without distortion from distorted ones, by Newton's method on the radius."""
     if k1 == 0.0:
         return x, y
@@ -58,7 +67,9 @@ def undistort_rays(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], k1: f
 
 def pixel_rays(intrinsics: Intrinsics) -> npt.NDArray[np.float64]:
     """Rays (H, W, 3) of all pixels in the camera frame, scaled so that z is 1."""
-    u, v = np.meshgrid(np.arange(intrinsics.width_px, dtype=np.float64), np.arange(intrinsics.height_px, dtype=np.float64))
+    u, v = np.meshgrid(
+        np.arange(intrinsics.width_px, dtype=np.float64), np.arange(intrinsics.height_px, dtype=np.float64)
+    )
     x, y = undistort_rays((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, intrinsics.k1)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 

@@ -42,8 +42,8 @@ class PredictionHints:
 class PredictedFrame:
     """Geometry of one keyframe.
 
-    ``depth`` (H, W) float32 along the optical axis, submap units, 0 where unknown; ``confidence`` (H, W) float32 in [0, 1],
-    0 where depth is unknown; ``intrinsics`` of that (H, W) lattice, which covers the whole image;
+    ``depth`` (H, W) float32 along the optical axis, submap units, 0 where unknown; ``confidence`` (H, W) float32 in
+    [0, 1], 0 where depth is unknown; ``intrinsics`` of that (H, W) lattice, which covers the whole image;
     ``submap_from_camera`` (4, 4) float64.
     """
 
@@ -75,12 +75,14 @@ class Predictor(Protocol):
     def predict(self, images: Sequence[KeyframeImage], hints: PredictionHints) -> Prediction:
         """Predict one submap.
 
-        Never raises for hard input: a submap that cannot be solved is returned with verdict FAILED or ROTATION_ONLY and a reason.
+        Never raises for hard input: a submap that cannot be solved comes back with verdict FAILED or ROTATION_ONLY and
+        a reason.
         """
         ...
 
 
-# name -> "module:factory"; a factory takes the ``inference`` section of the configuration. Modules are imported only when chosen.
+# name -> "module:factory"; a factory takes the ``inference`` section of the configuration. Modules are imported only
+# when chosen.
 _REGISTRY: dict[str, str] = {
     "sfm": "vggt_motion.inference.sfm.predictor:create",
 }

@@ -1,4 +1,4 @@
-"""What a source is (DESIGN section 2): frames as encoded bytes with index and capture time, and the registry of kinds."""
+"""What a source is (DESIGN section 2): frames as encoded bytes with index and capture time."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Frame:
 class Source(Protocol):
     """An opened source.
 
-    Iterating raises SourceError when not one frame can be read, and SourceTruncatedError after the last good frame when the
-    input ends early (unreadable frame, size change): everything yielded before stays valid.
+    Iterating raises SourceError when not one frame can be read, and SourceTruncatedError after the last good frame when
+    the input ends early (unreadable frame, size change): everything yielded before stays valid.
     """
 
     description: str  # one line for status and report: kind, path, size
