@@ -119,7 +119,7 @@ class FocalHint:
 
 @dataclass(frozen=True)
 class SubmapSpec:
-    """Composed submap M_k = O_k, R_k, L_k (paper eq. 4): the payload of a predict job."""
+    """Composed submap M_k = O_k, R_k, L_k (paper eq. 4)."""
 
     submap_index: int
     revision: int  # 1, or 2 when predicted again with a settled focal length
@@ -134,6 +134,14 @@ class SubmapSpec:
     def keyframe_ids(self) -> tuple[str, ...]:
         """All keyframes in the order of the submap: overlap, base, loop."""
         return self.overlap_keyframe_ids + self.base_keyframe_ids + self.loop_keyframe_ids
+
+
+@dataclass(frozen=True)
+class PredictTask:
+    """Payload of a predict job: everything that a worker without memory needs."""
+
+    spec: SubmapSpec
+    keyframes: tuple[Keyframe, ...]  # in the order of ``spec.keyframe_ids``
 
 
 class ScaleKind(StrEnum):
@@ -215,7 +223,7 @@ class ConstraintKind(StrEnum):
 
 @dataclass(frozen=True)
 class RegistrationSpec:
-    """Payload of a register job: which two submaps to align, and the frames that both contain, in time order."""
+    """Which two submaps to align, and the frames that both contain, in time order."""
 
     i: int
     j: int
@@ -228,6 +236,23 @@ class RegistrationSpec:
     def record_id(self) -> str:
         """Identity in the log, shared by the job and its constraint."""
         return constraint_id(self.kind, self.i, self.i_revision, self.j, self.j_revision)
+
+
+@dataclass(frozen=True)
+class SharedGeometry:
+    """One keyframe as two submaps see it."""
+
+    in_i: FrameGeometry
+    in_j: FrameGeometry
+
+
+@dataclass(frozen=True)
+class RegisterTask:
+    """Payload of a register job: everything that a worker without memory needs."""
+
+    spec: RegistrationSpec
+    shared: tuple[SharedGeometry, ...]  # in the order of ``spec.shared_keyframe_ids``
+    fix_scale: bool = False  # both sides are metric: SE(3)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import psutil
+import pytest
+
+from vggt_motion.compute import (
+    ComputeCancelledError,
+    ComputeChild,
+    ComputeCrashedError,
+    ComputeDeadlineError,
+    ComputeError,
+)
+
+
+@pytest.fixture
+def child() -> Iterator[ComputeChild]:
+    compute = ComputeChild("test")
+    yield compute
+    compute.kill()
+
+
+def test_result_comes_back_from_another_process_that_is_kept(child: ComputeChild) -> None:
+    first = child.call(os.getpid, deadline_s=30)
+    assert first != os.getpid()
+    assert child.call(os.getpid, deadline_s=30) == first
+
+
+def test_an_exception_keeps_its_message_and_traceback(child: ComputeChild) -> None:
+    with pytest.raises(ComputeError, match="ValueError") as caught:
+        child.call(int, "seven", deadline_s=30)
+    assert "Traceback" in caught.value.traceback_text
+    assert child.call(int, "7", deadline_s=30) == 7
+
+
+def test_deadline_ends_the_call_and_the_next_one_works(child: ComputeChild) -> None:
+    with pytest.raises(ComputeDeadlineError):
+        child.call(time.sleep, 60, deadline_s=0.2)
+    assert child.call(int, "7", deadline_s=30) == 7
+
+
+def test_cancel_ends_the_call(child: ComputeChild) -> None:
+    with pytest.raises(ComputeCancelledError):
+        child.call(time.sleep, 60, deadline_s=30, on_tick=lambda: False)
+
+
+def test_a_killed_child_is_named(child: ComputeChild) -> None:
+    pid = child.call(os.getpid, deadline_s=30)
+    killed = []
+
+    def kill_once() -> bool:
+        if not killed:
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+        return True
+
+    with pytest.raises(ComputeCrashedError, match="SIGKILL"):
+        child.call(time.sleep, 60, deadline_s=30, on_tick=kill_once)
+    assert child.call(int, "7", deadline_s=30) == 7
+
+
+def test_the_child_dies_with_a_killed_parent() -> None:
+    script = (
+        "import os, time\n"
+        "from vggt_motion.compute import ComputeChild\n"
+        "if __name__ == '__main__':\n"
+        "    child = ComputeChild('test')\n"
+        "    print(child.call(os.getpid, deadline_s=30), flush=True)\n"
+        "    child.call(time.sleep, 60, deadline_s=60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    for _ in range(100):
+        if not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(pid, signal.SIGKILL)
+        pytest.fail("the computing process outlived its parent")
