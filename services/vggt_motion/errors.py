@@ -6,6 +6,7 @@ line, into the exit code that the class carries (DESIGN section 5). Anything els
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import ClassVar
 
 
@@ -47,8 +48,24 @@ class BusUnavailableError(BusError):
     """No reply: the other side or the link is down. Safe to repeat: all our requests are idempotent."""
 
 
+class RefusalCode(StrEnum):
+    """Why a request was refused; travels in every error reply (``Refusal`` of the wire contract)."""
+
+    INVALID = "invalid"  # malformed, out of bounds, or of an unknown schema
+    CONFLICT = "conflict"  # the id is known with another content
+    DISK_FULL = "disk_full"  # below the reserve; raised as DiskFullError
+    UNKNOWN = "unknown"  # what was asked for does not exist
+    GONE = "gone"  # it existed and is no longer valid
+    UNAVAILABLE = "unavailable"  # stopping or overloaded; raised as BusUnavailableError
+    INTERNAL = "internal"  # a defect on the answering side; it is in its log
+
+
 class RequestRefusedError(BusError):
     """The other side understood the request and refused it; repeating it unchanged is useless."""
+
+    def __init__(self, message: str, code: RefusalCode = RefusalCode.INVALID) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 class CodecError(BusError):

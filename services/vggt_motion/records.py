@@ -399,6 +399,64 @@ class JobReport:
     last_traceback: str
 
 
+class DoneOutcome(StrEnum):
+    """What became of the result that a worker handed in."""
+
+    COMMITTED = "committed"  # record appended and job done, in one transaction
+    ALREADY_DONE = "already_done"  # done before; this result is dropped
+    DROPPED = "dropped"  # the job is unknown, cancelled or dead
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """One durable record of a stream; ``payload`` is the encoded record, opaque to the ledger."""
+
+    stream: str
+    sequence: int  # dense per stream, from 0
+    record_id: str
+    payload_type: str  # full name of the message in ``payload``
+    payload: bytes
+    append_time_ns: int  # wall clock of the ledger; informative only
+
+
+@dataclass(frozen=True)
+class StreamPosition:
+    """How far a stream is."""
+
+    stream: str
+    next_sequence: int  # number of records, and the sequence number of the next one
+
+
+@dataclass(frozen=True)
+class JobCount:
+    """Number of jobs of a kind in a state."""
+
+    kind: str
+    state: str
+    count: int
+
+
+@dataclass(frozen=True)
+class LedgerStatus:
+    """What the ledger says of itself."""
+
+    positions: tuple[StreamPosition, ...]
+    job_counts: tuple[JobCount, ...]
+    stored_bytes: int
+    free_bytes: int
+    is_accepting: bool  # False below the reserve of free disk
+    detail: str  # one line for a person; empty when all is well
+    refused_request_count: int  # since the ledger started
+
+    def position(self, stream: str) -> int:
+        """Number of records of a stream; 0 for one that has none."""
+        return next((entry.next_sequence for entry in self.positions if entry.stream == stream), 0)
+
+    def job_count(self, state: str, kind: str | None = None) -> int:
+        """Number of jobs in a state, of one kind or of all."""
+        return sum(entry.count for entry in self.job_counts if entry.state == state and kind in (None, entry.kind))
+
+
 @dataclass(frozen=True)
 class HealthReport:
     """What a service says of itself once a second, from its Python loop."""
