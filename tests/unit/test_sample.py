@@ -88,7 +88,7 @@ def _epipolar_error_px(
 
 
 def test_poses_belong_to_the_images(poses: npt.NDArray[np.float64], images: list[npt.NDArray[np.uint8]]) -> None:
-    """Points matched between neighbours lie on the epipolar lines of their poses, not on those of other frames' poses."""
+    """Points matched between neighbours lie on the epipolar lines of their own poses, not of other frames' poses."""
     sift = cv2.SIFT_create(1500)
     matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
     right, shifted = [], []
