@@ -1,4 +1,5 @@
 from vggt_motion.v1 import common_pb2 as _common_pb2
+from vggt_motion.v1 import submap_pb2 as _submap_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
@@ -73,3 +74,21 @@ class Constraint(_message.Message):
     point_count: int
     attempts: _containers.RepeatedCompositeFieldContainer[RegistrationAttempt]
     def __init__(self, schema_version: _Optional[int] = ..., spec: _Optional[_Union[RegistrationSpec, _Mapping]] = ..., accepted: bool = ..., reason: _Optional[str] = ..., j_from_i: _Optional[_Union[_common_pb2.Sim3, _Mapping]] = ..., inlier_ratio: _Optional[float] = ..., median_relative_residual: _Optional[float] = ..., information: _Optional[_Iterable[float]] = ..., point_count: _Optional[int] = ..., attempts: _Optional[_Iterable[_Union[RegistrationAttempt, _Mapping]]] = ...) -> None: ...
+
+class SharedGeometry(_message.Message):
+    __slots__ = ("in_i", "in_j")
+    IN_I_FIELD_NUMBER: _ClassVar[int]
+    IN_J_FIELD_NUMBER: _ClassVar[int]
+    in_i: _submap_pb2.FrameGeometry
+    in_j: _submap_pb2.FrameGeometry
+    def __init__(self, in_i: _Optional[_Union[_submap_pb2.FrameGeometry, _Mapping]] = ..., in_j: _Optional[_Union[_submap_pb2.FrameGeometry, _Mapping]] = ...) -> None: ...
+
+class RegisterTask(_message.Message):
+    __slots__ = ("spec", "shared", "fix_scale")
+    SPEC_FIELD_NUMBER: _ClassVar[int]
+    SHARED_FIELD_NUMBER: _ClassVar[int]
+    FIX_SCALE_FIELD_NUMBER: _ClassVar[int]
+    spec: RegistrationSpec
+    shared: _containers.RepeatedCompositeFieldContainer[SharedGeometry]
+    fix_scale: bool
+    def __init__(self, spec: _Optional[_Union[RegistrationSpec, _Mapping]] = ..., shared: _Optional[_Iterable[_Union[SharedGeometry, _Mapping]]] = ..., fix_scale: bool = ...) -> None: ...

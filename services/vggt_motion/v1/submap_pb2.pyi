@@ -1,4 +1,5 @@
 from vggt_motion.v1 import common_pb2 as _common_pb2
+from vggt_motion.v1 import keyframe_pb2 as _keyframe_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
@@ -140,3 +141,11 @@ class SubmapGeometry(_message.Message):
     quality: SubmapQuality
     stage_seconds: _containers.ScalarMap[str, float]
     def __init__(self, schema_version: _Optional[int] = ..., spec: _Optional[_Union[SubmapSpec, _Mapping]] = ..., verdict: _Optional[_Union[SubmapVerdict, str]] = ..., reason: _Optional[str] = ..., scale_kind: _Optional[_Union[ScaleKind, str]] = ..., model: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[FrameGeometry, _Mapping]]] = ..., quality: _Optional[_Union[SubmapQuality, _Mapping]] = ..., stage_seconds: _Optional[_Mapping[str, float]] = ...) -> None: ...
+
+class PredictTask(_message.Message):
+    __slots__ = ("spec", "keyframes")
+    SPEC_FIELD_NUMBER: _ClassVar[int]
+    KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
+    spec: SubmapSpec
+    keyframes: _containers.RepeatedCompositeFieldContainer[_keyframe_pb2.Keyframe]
+    def __init__(self, spec: _Optional[_Union[SubmapSpec, _Mapping]] = ..., keyframes: _Optional[_Iterable[_Union[_keyframe_pb2.Keyframe, _Mapping]]] = ...) -> None: ...
