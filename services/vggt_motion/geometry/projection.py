@@ -53,14 +53,19 @@ class Intrinsics:
 def undistort_rays(
     x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], k1: float
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Normalised coordinates without distortion from distorted ones, by Newton's method on the radius."""
+    """Normalised coordinates without distortion from distorted ones, by Newton's method on the radius.
+
+    Barrel distortion (``k1 < 0``) has a largest radius, ``1 / sqrt(-3 k1)``, past which the model folds back: what lies
+    beyond its image has no ray and gets that radius.
+    """
     if k1 == 0.0:
         return x, y
     distorted_radius = np.hypot(x, y)
     radius = distorted_radius.copy()
+    fold = 1.0 / np.sqrt(-3.0 * k1) if k1 < 0.0 else np.inf
     for _ in range(_UNDISTORT_ITERATIONS):
         slope = np.maximum(1.0 + 3.0 * k1 * radius**2, 0.1)
-        radius -= (radius * (1.0 + k1 * radius**2) - distorted_radius) / slope
+        radius = np.clip(radius - (radius * (1.0 + k1 * radius**2) - distorted_radius) / slope, 0.0, fold)
     factor = np.where(distorted_radius > 1e-12, radius / np.maximum(distorted_radius, 1e-12), 1.0)
     return x * factor, y * factor
 

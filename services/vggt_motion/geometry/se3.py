@@ -26,7 +26,8 @@ def so3_exp(rotation_vector: Array) -> Array:
     k = skew(rotation_vector)
     if angle < _SMALL_ANGLE_RAD:
         return np.eye(3) + k + 0.5 * (k @ k)
-    return np.eye(3) + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k)
+    first, second = float(np.sin(angle) / angle), float((1.0 - np.cos(angle)) / angle**2)
+    return np.eye(3) + first * k + second * (k @ k)
 
 
 def so3_log(rotation: Array) -> Array:
@@ -39,7 +40,7 @@ def so3_log(rotation: Array) -> Array:
     norm = float(np.linalg.norm(vector))
     if norm < 1e-12:
         return 2.0 * vector
-    return (2.0 * np.arctan2(norm, w) / norm) * vector
+    return float(2.0 * np.arctan2(norm, w) / norm) * vector
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:
@@ -94,7 +95,8 @@ def act(target_from_source: Array, points_source: Array) -> Array:
 def nearest_rotation(matrix: Array) -> Array:
     """The rotation (3, 3) closest in Frobenius norm to a matrix (3, 3), determinant +1."""
     u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return np.asarray((u * signs) @ vt, dtype=np.float64)
 
 
 def exp(tangent: Array) -> Array:
@@ -105,11 +107,7 @@ def exp(tangent: Array) -> Array:
     if angle < _SMALL_ANGLE_RAD:
         v_matrix = np.eye(3) + 0.5 * k + (k @ k) / 6.0
     else:
-        v_matrix = (
-            np.eye(3)
-            + ((1.0 - np.cos(angle)) / angle**2) * k
-            + ((angle - np.sin(angle)) / angle**3) * (k @ k)
-        )
+        v_matrix = np.eye(3) + ((1.0 - np.cos(angle)) / angle**2) * k + ((angle - np.sin(angle)) / angle**3) * (k @ k)
     return make(so3_exp(omega), v_matrix @ v)
 
 
