@@ -1,0 +1,84 @@
+"""The log folded into what the planner, the pose graph and the trajectory need to know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from vggt_motion.records import (
+    Constraint,
+    Event,
+    EventKind,
+    GraphUpdate,
+    Keyframe,
+    Segment,
+    SubmapGeometry,
+    SubmapVerdict,
+)
+
+MAX_REVISION = 2  # a submap is predicted at most once more, with a settled focal length
+_USABLE = frozenset({SubmapVerdict.GOOD, SubmapVerdict.LOW_QUALITY, SubmapVerdict.ROTATION_ONLY})
+
+
+@dataclass
+class LogState:
+    """Everything that the log says, by identity.
+
+    Applying a record twice, or records of different streams in another order, gives the same state.
+    """
+
+    keyframes: dict[str, Keyframe] = field(default_factory=dict)
+    segments: dict[int, Segment] = field(default_factory=dict)
+    submaps: dict[tuple[int, int], SubmapGeometry] = field(default_factory=dict)  # (index, revision)
+    constraints: dict[str, Constraint] = field(default_factory=dict)
+    dead_jobs: dict[str, Event] = field(default_factory=dict)
+    graphs: dict[str, GraphUpdate] = field(default_factory=dict)  # only the newest live one and the final one
+    events: dict[str, Event] = field(default_factory=dict)
+
+    def apply(self, record: Keyframe | Segment | SubmapGeometry | Constraint | GraphUpdate | Event) -> None:
+        """Take in one record of the log."""
+        match record:
+            case Keyframe():
+                self.keyframes[record.keyframe_id] = record
+            case Segment():
+                self.segments[record.index] = record
+            case SubmapGeometry():
+                self.submaps[(record.spec.submap_index, record.spec.revision)] = record
+            case Constraint():
+                self.constraints[record.record_id] = record
+            case GraphUpdate():
+                newest = self.latest_graph()
+                is_newer = newest is None or (not newest.is_final and record.revision >= newest.revision)
+                if record.is_final or is_newer:
+                    self.graphs = {record.record_id: record}
+            case Event():
+                self.events[record.event_id] = record
+                if record.kind is EventKind.JOB_DEAD:
+                    self.dead_jobs[record.detail.get("job_id", record.event_id)] = record
+
+    @property
+    def stream_ended(self) -> Event | None:
+        """The event that closed the input, if it has come."""
+        return next((e for e in self.events.values() if e.kind is EventKind.STREAM_ENDED), None)
+
+    @property
+    def is_input_complete(self) -> bool:
+        """Whether the input is closed and every segment that it promised is here."""
+        ended = self.stream_ended
+        return ended is not None and len(self.segments) >= int(ended.detail.get("segment_count", "0"))
+
+    def latest_graph(self) -> GraphUpdate | None:
+        """The final graph, or else the newest live one."""
+        return next(iter(self.graphs.values()), None)
+
+    def submap(self, index: int) -> SubmapGeometry | None:
+        """The submap's usable geometry of the highest revision; a failed revision never hides an earlier good one."""
+        for revision in range(MAX_REVISION, 0, -1):
+            geometry = self.submaps.get((index, revision))
+            if geometry is not None and geometry.verdict in _USABLE and geometry.frames:
+                return geometry
+        return None
+
+    def usable_submaps(self) -> dict[int, SubmapGeometry]:
+        """:meth:`submap` of every index that has one, in index order."""
+        found = ((index, self.submap(index)) for index in sorted({index for index, _ in self.submaps}))
+        return {index: geometry for index, geometry in found if geometry is not None}

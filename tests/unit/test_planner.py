@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vggt_motion.backend import focal, planner
+from vggt_motion.backend.state import LogState
+from vggt_motion.config import Config, load_config
+from vggt_motion.geometry.projection import Intrinsics
+from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.records import (
+    BlobRef,
+    Constraint,
+    Event,
+    EventKind,
+    FrameGeometry,
+    JobKind,
+    Keyframe,
+    MotionState,
+    PredictTask,
+    RegisterTask,
+    ScaleKind,
+    Segment,
+    SubmapGeometry,
+    SubmapQuality,
+    SubmapSpec,
+    SubmapVerdict,
+)
+
+BLOB = BlobRef("0" * 64, 1, "image/jpeg")
+CONFIG = Config()
+
+
+def keyframe(index: int) -> Keyframe:
+    return Keyframe("front", 0, index, index * 100_000_000, MotionState.LINEAR, 620, 188, BLOB)
+
+
+def segment(index: int, base: int = 4, overlap: int = 2) -> Segment:
+    def ids(first: int, count: int) -> tuple[str, ...]:
+        return tuple(keyframe(i).keyframe_id for i in range(first, first + count))
+
+    return Segment(
+        index=index,
+        camera="front",
+        epoch=0,
+        base_keyframe_ids=ids(index * base, base),
+        overlap_keyframe_ids=ids(index * base - overlap, overlap) if index else (),
+        frames=(),
+        closed_by="budget",
+    )
+
+
+def geometry(spec: SubmapSpec, focal_over_width: float = 0.58, sigma: float = 0.02) -> SubmapGeometry:
+    lattice = Intrinsics.centred(180.0, 310, 94)
+    frames = tuple(FrameGeometry(name, lattice, np.eye(4), BLOB) for name in spec.keyframe_ids)
+    quality = SubmapQuality(len(frames), 0.3, 0.9, 3.0, focal_over_width, sigma)
+    return SubmapGeometry(spec, SubmapVerdict.GOOD, "", ScaleKind.RELATIVE, "test", frames, quality)
+
+
+def constraint(task: RegisterTask) -> Constraint:
+    return Constraint(task.spec, True, "", Sim3.identity(), 1.0, 0.01, np.eye(7), 1000)
+
+
+def dead(job_id: str) -> Event:
+    return Event(f"job_dead/{job_id}", EventKind.JOB_DEAD, "gave up", 0, {"job_id": job_id})
+
+
+def started(segment_count: int, *, ended: bool = True) -> LogState:
+    state = LogState()
+    for index in range(segment_count):
+        entry = segment(index)
+        state.apply(entry)
+        for name in entry.base_keyframe_ids:
+            state.apply(keyframe(int(name.rsplit("/", 1)[1])))
+    if ended:
+        detail = {"frame_count": "9", "segment_count": str(segment_count)}
+        state.apply(Event("stream_ended", EventKind.STREAM_ENDED, "", 0, detail))
+    return state
+
+
+def result(job: planner.PlannedJob, focals: dict[int, float], sigma: float) -> SubmapGeometry | Constraint:
+    if isinstance(job.task, RegisterTask):
+        return constraint(job.task)
+    hint = job.task.spec.focal_hint
+    if job.task.spec.revision == 2:
+        assert hint is not None
+        return geometry(job.task.spec, hint.focal_over_width, sigma)
+    return geometry(job.task.spec, focals.get(job.task.spec.submap_index, 0.58), sigma)
+
+
+def run(
+    state: LogState,
+    order: random.Random,
+    focals: dict[int, float] | None = None,
+    sigma: float = 0.02,
+    dead_share: float = 0.0,
+) -> None:
+    """Carry out whatever is planned, one job at a time in random order, until nothing is left."""
+    doomed = {f"submap/{index:06d}/r1" for index in range(100) if (index * 7919) % 100 < 100 * dead_share}
+    for _ in range(10_000):
+        jobs = planner.next_jobs(state, CONFIG)
+        if not jobs:
+            return
+        job = order.choice(jobs)
+        state.apply(dead(job.job_id) if job.job_id in doomed else result(job, focals or {}, sigma))
+    raise AssertionError("the plan does not end")
+
+
+def test_a_segment_without_its_keyframes_waits() -> None:
+    state = LogState()
+    state.apply(segment(0))
+    assert planner.next_jobs(state, CONFIG) == []
+
+
+def test_the_hint_of_submap_k_folds_submaps_0_to_k_minus_3() -> None:
+    state = started(6)
+    first = planner.next_jobs(state, CONFIG)
+    assert [job.job_id for job in first] == [f"submap/{k:06d}/r1" for k in range(3)]
+    assert all(isinstance(job.task, PredictTask) and job.task.spec.focal_hint is None for job in first)
+    # 2 before 0: submap 3 has to wait for 0 all the same.
+    assert isinstance(first[2].task, PredictTask) and isinstance(first[0].task, PredictTask)
+    state.apply(geometry(first[2].task.spec, 0.7))
+    assert "submap/000003/r1" not in {job.job_id for job in planner.next_jobs(state, CONFIG)}
+    state.apply(geometry(first[0].task.spec, 0.6))
+    third = next(job for job in planner.next_jobs(state, CONFIG) if job.job_id == "submap/000003/r1")
+    assert isinstance(third.task, PredictTask) and third.task.spec.focal_hint is not None
+    assert third.task.spec.focal_hint.focal_over_width == pytest.approx(0.6)
+
+
+def quality(focal_over_width: float, sigma: float) -> SubmapQuality:
+    return SubmapQuality(17, 0.3, 0.9, 3.0, focal_over_width, sigma)
+
+
+def test_two_results_of_equal_sigma_give_their_geometric_mean() -> None:
+    results = [quality(0.5, 0.02), None, quality(0.6, 0.02), quality(0.9, math.inf), quality(math.nan, 0.01)]
+    hint = focal.fold(results).hint()
+    assert hint is not None
+    assert hint.focal_over_width == pytest.approx(math.sqrt(0.5 * 0.6), rel=1e-12)
+
+
+def test_sigma_shrinks_as_agreeing_results_come_in() -> None:
+    # n equal results of variance s^2 (plus 1 % for the model) have variance (s^2 + 0.01^2) / n.
+    hint = focal.fold([quality(0.58, 0.03)] * 16).hint()
+    assert hint is not None
+    assert hint.relative_sigma == pytest.approx(math.sqrt((0.03**2 + 0.01**2) / 16), rel=1e-12)
+    assert hint.focal_over_width == pytest.approx(0.58)
+
+
+def test_a_confident_but_wrong_result_neither_rules_nor_settles() -> None:
+    wrong_first = [quality(0.7, 0.005)] + [quality(0.58, 0.01)] * 2
+    assert focal.fold(wrong_first[:2]).settled_hint() is None
+    hint = focal.fold(wrong_first + [quality(0.58, 0.01)] * 4).settled_hint()
+    assert hint is not None and hint.focal_over_width == pytest.approx(0.58, rel=0.01)
+
+
+def test_a_known_camera_needs_no_waiting_and_no_second_revision() -> None:
+    config = load_config(assignments=["inference.focal_over_width=0.58"])
+    state = started(6)
+    jobs = planner.next_jobs(state, config)
+    assert len(jobs) == 6
+    for job in jobs:
+        assert isinstance(job.task, PredictTask) and job.task.spec.focal_hint is not None
+        assert job.task.spec.focal_hint.is_fixed
+        state.apply(geometry(job.task.spec, 0.9, 0.001))
+    assert {job.kind for job in planner.next_jobs(state, config)} == {JobKind.REGISTER}
+
+
+def test_submaps_that_the_settled_estimate_contradicts_are_predicted_once_more() -> None:
+    state = started(8)
+    run(state, random.Random(0), {0: 0.7, 1: 0.575}, sigma=0.01)
+    # Submap 0 is 0.7 against 0.58 of all others: it alone is done again, with the estimate that had settled.
+    assert {key for key in state.submaps if key[1] == 2} == {(0, 2)}
+    used = state.submap(0)
+    assert used is not None and used.quality.focal_over_width < 0.65
+    assert planner.is_complete(state, CONFIG)
+    revisions = {(c.spec.i, c.spec.i_revision, c.spec.j, c.spec.j_revision) for c in planner.current_constraints(state)}
+    assert revisions == {(0, 2, 1, 1)} | {(k, 1, k + 1, 1) for k in range(1, 7)}
+
+
+def test_a_dead_submap_does_not_hold_up_the_others() -> None:
+    state = started(9)
+    state.apply(dead("submap/000004/r1"))
+    run(state, random.Random(0))
+    assert planner.is_complete(state, CONFIG)
+    assert sorted(index for index, _ in state.submaps) == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+def test_a_failed_submap_is_not_registered() -> None:
+    state = started(3)
+    for job in planner.next_jobs(state, CONFIG):
+        assert isinstance(job.task, PredictTask)
+        done = geometry(job.task.spec)
+        failed = replace(done, verdict=SubmapVerdict.FAILED, frames=(), reason="no texture")
+        state.apply(failed if job.task.spec.submap_index == 1 else done)
+    assert planner.next_jobs(state, CONFIG) == []
+    assert planner.is_complete(state, CONFIG)
+    assert sorted(state.usable_submaps()) == [0, 2]
+
+
+def test_not_complete_before_the_input_is_closed() -> None:
+    state = started(3, ended=False)
+    run(state, random.Random(0))
+    assert not planner.is_complete(state, CONFIG)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    count=st.integers(1, 12),
+    sigma=st.floats(0.002, 0.3),
+    focals=st.dictionaries(st.integers(0, 11), st.floats(0.4, 0.9), max_size=6),
+    dead_share=st.sampled_from([0.0, 0.2]),
+)
+def test_the_outcome_does_not_depend_on_who_is_faster(
+    seed: int, count: int, sigma: float, focals: dict[int, float], dead_share: float
+) -> None:
+    outcomes = []
+    for order in (random.Random(seed), random.Random(seed + 1)):
+        state = started(count, ended=False)
+        run(state, order, focals, sigma, dead_share)
+        state.apply(started(count).events["stream_ended"])
+        run(state, order, focals, sigma, dead_share)
+        assert planner.is_complete(state, CONFIG)
+        specs = {key: value.spec for key, value in state.submaps.items()}
+        outcomes.append((specs, sorted(state.constraints), sorted(state.dead_jobs)))
+    assert outcomes[0] == outcomes[1]
