@@ -1,0 +1,99 @@
+"""Is there any parallax? The rotation-only model of a submap, kept when nothing else can be known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vggt_motion.geometry.se3 import nearest_rotation
+
+Array = npt.NDArray[np.float64]
+Pair = tuple[int, int]
+
+_FOCAL_GRID = np.geomspace(0.4, 3.0, 15)  # focal length / image width, from a wide action camera to a small tele lens
+_ITERATIONS = 8
+_MIN_MATCHES = 12
+
+
+@dataclass(frozen=True)
+class RotationFit:
+    """How well a rotating, not moving camera explains the matches."""
+
+    camera_from_submap: dict[int, Array]  # position -> (3, 3) rotation, chained over neighbours
+    focal_px: float
+    residual_px: float  # upper quartile over the widest pairs of their median residual
+
+
+def fit_rotation(points_a: Array, points_b: Array, focal_px: float) -> tuple[Array, Array]:
+    """Robust rotation ``b_from_a`` (3, 3) and residuals (N,) in pixels.
+
+    Points (N, 2) are in pixels relative to the principal point.
+    """
+    rays_a = _rays(points_a, focal_px)
+    rays_b = _rays(points_b, focal_px)
+    weights = np.ones(len(rays_a))
+    rotation = np.eye(3)
+    residuals = np.zeros(len(rays_a))
+    for _ in range(_ITERATIONS):
+        rotation = nearest_rotation((rays_b * weights[:, None]).T @ rays_a)
+        residuals = _residuals(rays_a @ rotation.T, points_b, focal_px)
+        scale = max(float(np.median(residuals)), 0.05)
+        weights = 1.0 / (1.0 + (residuals / (2.0 * scale)) ** 2)
+    return rotation, residuals
+
+
+def fit_rotations(
+    matched: Mapping[Pair, tuple[Array, Array]], positions: Sequence[int], focal_px: float | None, width_px: int
+) -> RotationFit | None:
+    """Explain the matches of a submap by rotations alone.
+
+    Args:
+        matched: pair -> matched points (N, 2) of both images in pixels relative to the principal point.
+        positions: the frames in time order.
+        focal_px: None where unknown; the best of a grid is then taken.
+        width_px: image width, the unit of the grid.
+
+    Returns:
+        None where the frames are not connected.
+    """
+    usable = {pair: points for pair, points in matched.items() if len(points[0]) >= _MIN_MATCHES}
+    focals = [focal_px] if focal_px is not None else [float(value) * width_px for value in _FOCAL_GRID]
+    best: RotationFit | None = None
+    for focal in focals:
+        fits = {pair: fit_rotation(points[0], points[1], focal) for pair, points in usable.items()}
+        rotations = _chain({pair: rotation for pair, (rotation, _) in fits.items()}, positions)
+        if rotations is None:
+            return None
+        medians = [float(np.median(residuals)) for _, residuals in fits.values()]
+        residual = float(np.percentile(medians, 75)) if medians else 0.0
+        if best is None or residual < best.residual_px:
+            best = RotationFit(rotations, focal, residual)
+    return best
+
+
+def _chain(b_from_a: Mapping[Pair, Array], positions: Sequence[int]) -> dict[int, Array] | None:
+    """Rotations ``camera_from_first`` of all positions over the nearest available pairs."""
+    rotations = {positions[0]: np.eye(3)}
+    for position in positions[1:]:
+        for previous in sorted((p for p in rotations), key=lambda p: abs(position - p)):
+            if (previous, position) in b_from_a:
+                rotations[position] = b_from_a[previous, position] @ rotations[previous]
+                break
+        else:
+            return None
+    return rotations
+
+
+def _rays(points: Array, focal_px: float) -> Array:
+    rays = np.column_stack([points / focal_px, np.ones(len(points))])
+    unit: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
+
+
+def _residuals(rays: Array, points: Array, focal_px: float) -> Array:
+    depth = np.where(rays[:, 2] > 1e-3, rays[:, 2], 1e-3)
+    residuals: Array = np.linalg.norm(rays[:, :2] / depth[:, None] * focal_px - points, axis=1)
+    return residuals
