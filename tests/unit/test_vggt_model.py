@@ -1,0 +1,219 @@
+"""The VGGT network against reference outputs, and its parts against closed forms."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'vggt-motion[torch]'")
+
+from rule_weights import fixture_dir, rule_weights  # noqa: E402
+from vggt_motion.errors import InputError  # noqa: E402
+from vggt_motion.inference.vggt.architecture import SMALL, VGGT_1B, VggtArchitecture, architecture_of  # noqa: E402
+from vggt_motion.inference.vggt.dense_head import Fusion, add_position, axis_encoding  # noqa: E402
+from vggt_motion.inference.vggt.layers import Attention, Mlp, Rotary  # noqa: E402
+from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
+
+# sha256 over the sorted lines "name shape" of the published 1B model's state dict and of the small configuration's
+NAME_DIGESTS = {
+    "vggt_1b": "f5bcc85a31452cd37bb0be6721c3a8ffa498beb82974e8eb215a423eb4b01d4a",
+    "small": "881006580512fa1d70dbf2a2ff1f65e08a2c4b10e839a6e4fced8acdaaf91bc6",
+}
+
+
+def shapes_of(model: torch.nn.Module) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in model.state_dict().items()}
+
+
+def digest(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    lines = sorted(f"{name} {list(shape)}\n" for name, shape in shapes.items())
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def meta_model(architecture: VggtArchitecture, **heads: bool) -> Vggt:
+    with torch.device("meta"):
+        return Vggt(architecture, **heads)
+
+
+@pytest.fixture(scope="module")
+def small() -> Vggt:
+    model = meta_model(SMALL, with_points=True)
+    weights = rule_weights(shapes_of(model))
+    model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()}, assign=True)
+    return model.eval()
+
+
+def random_images(frames: int, height: int, width: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(1, frames, 3, height, width, generator=torch.Generator().manual_seed(seed))
+
+
+class TestAgainstReference:
+    @pytest.mark.parametrize("frame_chunk", [1, 2, 8])
+    def test_outputs(self, small: Vggt, frame_chunk: int) -> None:
+        expected = np.load(fixture_dir("vggt") / "small_expected.npz")
+        images = torch.from_numpy(expected["images_uint8"]).permute(0, 3, 1, 2)[None].float() / 255
+        output = small(images, frame_chunk=frame_chunk)
+        assert output.points is not None
+        assert output.point_confidence is not None
+        for name, value in {
+            "pose_enc": output.pose_encoding,
+            "depth": output.depth,
+            "depth_conf": output.depth_confidence,
+            "world_points": output.points,
+            "world_points_conf": output.point_confidence,
+        }.items():
+            np.testing.assert_allclose(value[0].numpy(), expected[name], rtol=1e-4, atol=1e-4, err_msg=name)
+
+    @pytest.mark.parametrize(
+        ("name", "architecture", "with_tracking"), [("small", SMALL, False), ("vggt_1b", VGGT_1B, True)]
+    )
+    def test_names_and_shapes(self, name: str, architecture: VggtArchitecture, with_tracking: bool) -> None:
+        expected = json.loads((fixture_dir("vggt") / f"{name}_state_dict.json").read_text())
+        shapes = {key: tuple(value) for key, value in expected.items()}
+        assert shapes_of(meta_model(architecture, with_points=True, with_tracking=with_tracking)) == shapes
+        assert digest(shapes) == NAME_DIGESTS[name]
+
+
+class TestArchitecture:
+    @pytest.mark.parametrize(
+        ("name", "architecture", "with_tracking"), [("small", SMALL, False), ("vggt_1b", VGGT_1B, True)]
+    )
+    def test_name_digest(self, name: str, architecture: VggtArchitecture, with_tracking: bool) -> None:
+        shapes = shapes_of(meta_model(architecture, with_points=True, with_tracking=with_tracking))
+        assert digest(shapes) == NAME_DIGESTS[name]
+        assert architecture_of(shapes) == architecture
+
+    def test_heads_that_nobody_asked_for_are_not_built(self) -> None:
+        names = shapes_of(meta_model(VGGT_1B))
+        assert not any(name.startswith(("point_head.", "track_head.")) for name in names)
+
+    def test_unknown_depth_needs_levels(self) -> None:
+        shapes = shapes_of(meta_model(SMALL))
+        shapes = {name: shape for name, shape in shapes.items() if "_blocks.3." not in name}
+        with pytest.raises(InputError, match="dense_levels"):
+            architecture_of(shapes)
+        with pytest.raises(InputError, match="rising"):
+            architecture_of(shapes, dense_levels=(0, 1, 2, 3))
+
+    @pytest.mark.parametrize("gone", ["aggregator.camera_token", "aggregator.patch_embed.pos_embed"])
+    def test_foreign_names_are_refused(self, gone: str) -> None:
+        shapes = shapes_of(meta_model(SMALL))
+        del shapes[gone]
+        with pytest.raises(InputError, match=gone):
+            architecture_of(shapes)
+
+
+class TestRotary:
+    def test_equals_complex_rotation(self) -> None:
+        generator = torch.Generator().manual_seed(1)
+        positions = torch.randint(0, 40, (7, 2), generator=generator)
+        x = torch.randn(2, 7, 3, 64, generator=generator)
+        turned = Rotary(positions, 64)(x).double().numpy()
+        for axis in range(2):
+            half = x[..., 32 * axis : 32 * axis + 32].double().numpy()
+            number = half[..., :16] + 1j * half[..., 16:]
+            angle = positions[:, axis].numpy()[:, None] * 100.0 ** (-2 * np.arange(16) / 32)
+            expected = number * np.exp(1j * angle)[None, :, None, :]
+            np.testing.assert_allclose(turned[..., 32 * axis : 32 * axis + 16], expected.real, atol=1e-5)
+            np.testing.assert_allclose(turned[..., 32 * axis + 16 : 32 * axis + 32], expected.imag, atol=1e-5)
+
+    def test_products_depend_on_distance_only(self) -> None:
+        generator = torch.Generator().manual_seed(2)
+        q, k = torch.randn(2, 1, 1, 1, 64, generator=generator)
+
+        def product(at_q: tuple[int, int], at_k: tuple[int, int]) -> float:
+            turned_q = Rotary(torch.tensor([at_q]), 64)(q)
+            return float((turned_q * Rotary(torch.tensor([at_k]), 64)(k)).sum())
+
+        assert product((3, 5), (10, 1)) == pytest.approx(product((13, 25), (20, 21)), abs=1e-4)
+        assert product((3, 5), (10, 1)) != pytest.approx(product((3, 5), (11, 1)), abs=1e-2)
+
+    def test_origin_is_left_alone(self) -> None:
+        x = random_images(2, 5, 64)[0]
+        assert torch.equal(Rotary(torch.zeros(3, 2, dtype=torch.long), 64)(x), x)
+
+
+class TestPositionEncoding:
+    @pytest.mark.parametrize(
+        ("rows", "columns", "height", "width"), [(7, 10, 98, 140), (98, 140, 98, 140), (3, 2, 60, 20)]
+    )
+    def test_equals_closed_form(self, rows: int, columns: int, height: int, width: int) -> None:
+        channels = 12
+        maps = add_position(torch.zeros(1, channels, rows, columns), width / height)[0].numpy()
+        aspect = width / height
+        a, b = aspect / math.hypot(aspect, 1), 1 / math.hypot(aspect, 1)
+        for row in (0, rows // 2, rows - 1):
+            v = b * (2 * row + 1 - rows) / rows
+            for column in (0, columns - 1):
+                u = a * (2 * column + 1 - columns) / columns
+                frequencies = [100 ** (-k / 3) for k in range(3)]
+                expected = [
+                    0.1 * turn(coordinate * frequency)
+                    for coordinate in (u, v)
+                    for turn in (math.sin, math.cos)
+                    for frequency in frequencies
+                ]
+                np.testing.assert_allclose(maps[:, row, column], expected, atol=1e-6)
+
+    def test_single_pixel_is_the_middle(self) -> None:
+        np.testing.assert_allclose(axis_encoding(1, 0.8, 4)[:, 0], [0, 0, 1, 1])
+
+
+class TestParts:
+    def test_attention_equals_softmax(self) -> None:
+        torch.manual_seed(3)
+        attention = Attention(128, 2)
+        x = torch.randn(2, 5, 128)
+        q, k, v = attention.qkv(x).view(2, 5, 3, 2, 64).permute(2, 0, 3, 1, 4)
+        weights = torch.softmax(q @ k.transpose(-1, -2) / 8.0, dim=-1)
+        expected = attention.proj((weights @ v).transpose(1, 2).reshape(2, 5, 128))
+        torch.testing.assert_close(attention(x), expected, rtol=1e-5, atol=1e-5)
+
+    @torch.inference_mode()
+    def test_mlp_chunks_do_not_change_the_result(self) -> None:
+        torch.manual_seed(4)
+        mlp = Mlp(8, 32, 5, token_chunk=3)
+        x = torch.randn(2, 7, 8)
+        chunked = mlp(x)
+        mlp.token_chunk = None
+        torch.testing.assert_close(chunked, mlp(x))
+
+    def test_convolution_before_resize_equals_after(self) -> None:
+        torch.manual_seed(5)
+        fusion = Fusion(6, has_side=False)
+        maps = torch.randn(1, 6, 4, 5)
+        unit = fusion.resConfUnit2
+        rectified = maps.clamp(min=0)
+        summed = unit.conv2(unit.conv1(rectified).clamp(min=0)) + rectified
+        resized = torch.nn.functional.interpolate(summed, size=(8, 10), mode="bilinear", align_corners=True)
+        torch.testing.assert_close(fusion(maps, (8, 10)), fusion.out_conv(resized), rtol=1e-5, atol=1e-5)
+
+
+class TestPass:
+    def test_a_batch_equals_single_submaps(self, small: Vggt) -> None:
+        first, second = random_images(2, 56, 84, seed=6), random_images(2, 56, 84, seed=7)
+        both = small(torch.cat([first, second]), frame_chunk=3)
+        for index, images in enumerate((first, second)):
+            alone = small(images)
+            torch.testing.assert_close(both.pose_encoding[index], alone.pose_encoding[0], rtol=1e-4, atol=1e-4)
+            torch.testing.assert_close(both.depth[index], alone.depth[0], rtol=1e-4, atol=1e-4)
+
+    def test_repeats_exactly(self, small: Vggt) -> None:
+        images = random_images(2, 28, 42, seed=8)
+        assert torch.equal(small(images).depth, small(images).depth)
+
+    def test_input_is_not_written_to(self, small: Vggt) -> None:
+        images = random_images(1, 28, 28, seed=9)
+        before = images.clone()
+        small(images)
+        assert torch.equal(images, before)
+
+    def test_times_every_part(self, small: Vggt) -> None:
+        seconds = small(random_images(1, 28, 28)).seconds
+        assert set(seconds) == {"patch_embedding", "frame_attention", "global_attention", "dense_head", "camera_head"}
+        assert all(value > 0 for value in seconds.values())
