@@ -124,7 +124,12 @@ class RegistrationConfig(Section):
     anchor: Literal["window1", "window3", "window5", "full"] = "window1"
     confidence_mode: Literal["quantile", "mean_coef", "median_coef", "absolute"] = "quantile"
     confidence_value: float = Field(0.5, ge=0, description="tau_conf in the chosen mode")
+    residual: Literal["depth_relative", "absolute"] = Field(
+        "depth_relative", description="absolute is the peers' baseline"
+    )
     huber_relative: float = Field(0.02, gt=0, description="Huber width on depth-relative residuals")
+    huber_absolute: float = Field(0.1, gt=0, description="Huber width, submap units, for residual = absolute")
+    scale_rule: Literal["least_squares", "symmetric"] = "symmetric"
     inlier_relative: float = Field(0.05, gt=0, description="inlier radius on depth-relative residuals")
     max_iterations: int = Field(20, ge=1)
     min_inlier_ratio: float = Field(0.5, ge=0, le=1, description="tau_in: below it the edge is dropped")

@@ -1,0 +1,243 @@
+"""Anchor-driven registration of two submaps (paper section 3.2, DESIGN 3.5).
+
+Both submaps hold point maps of the same images, so that a pixel is its own correspondence. The context-balanced
+middle of the overlap is tried first; what fails there is tried on wider anchors up to the whole overlap, and every
+attempt is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vggt_motion.config import RegistrationConfig
+from vggt_motion.errors import RegistrationError
+from vggt_motion.geometry import se3
+from vggt_motion.geometry.projection import Intrinsics, pixel_rays
+from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.records import Constraint, RegistrationAttempt, RegistrationSpec
+from vggt_motion.registration.sim3 import Sim3Estimate, estimate_sim3
+
+Array = npt.NDArray[np.float64]
+
+_WINDOWS: dict[str, int | None] = {"window1": 1, "window3": 3, "window5": 5, "full": None}
+# Depth triangulated over a baseline a hundred times shorter hangs on a disparity of a few pixels.
+_MAX_DEPTH_OVER_BASELINE = 100.0
+_MIN_BASELINE_FRAMES = 3
+# Standard deviation of the valid pixels' rays across their main direction; below it they lie along a line in the image.
+_MIN_RAY_SPREAD = 0.01
+# Width of the middle 80 % of log-depth; below it the depth map is a constant, as of a predictor that saw nothing.
+_MIN_LOG_DEPTH_SPREAD = 0.02
+# Points and cameras of the same submaps that differ by more contradict each other, as in a mirrored submap.
+_MAX_DISAGREEMENT_RAD = 0.1
+
+
+@dataclass(frozen=True)
+class AnchorView:
+    """One keyframe as one submap sees it."""
+
+    depth: npt.NDArray[np.float32]  # (H, W) along the optical axis, submap units, 0 where unknown
+    confidence: npt.NDArray[np.float32]  # (H, W) in [0, 1], 0 where unknown or sky
+    intrinsics: Intrinsics  # of that lattice
+    submap_from_camera: Array  # (4, 4)
+
+
+@dataclass(frozen=True)
+class SharedFrame:
+    """One keyframe as both submaps see it."""
+
+    keyframe_id: str
+    in_i: AnchorView
+    in_j: AnchorView
+
+
+def register(
+    spec: RegistrationSpec,
+    shared: Sequence[SharedFrame],
+    config: RegistrationConfig,
+    *,
+    fix_scale: bool = False,
+) -> Constraint:
+    """Align submap i to submap j by the keyframes that both contain.
+
+    Args:
+        spec: which pair, and the keyframes W that both contain.
+        shared: those of W that are registered on both sides, in time order.
+        config: anchor to begin with, masks, robust estimation, acceptance.
+        fix_scale: both sides are metric: SE(3).
+
+    Returns:
+        The constraint; refused, with a reason, where no anchor gives a trustworthy transform. Never raises for hard
+        input.
+    """
+    attempts: list[RegistrationAttempt] = []
+    for name, frames in _ladder(spec, shared, config.anchor):
+        ids = tuple(frame.keyframe_id for frame in frames)
+        try:
+            estimate = _estimate(frames, shared, config, fix_scale=fix_scale)
+        except RegistrationError as error:
+            attempts.append(RegistrationAttempt(name, ids, 0, 0.0, float("nan"), str(error)))
+            continue
+        outcome = "accepted"
+        if estimate.inlier_ratio < config.min_inlier_ratio:
+            outcome = f"inlier ratio {estimate.inlier_ratio:.2f} is below {config.min_inlier_ratio:.2f}"
+        attempts.append(
+            RegistrationAttempt(
+                name, ids, estimate.point_count, estimate.inlier_ratio, estimate.median_relative_residual, outcome
+            )
+        )
+        if outcome == "accepted":
+            return Constraint(
+                spec=spec,
+                accepted=True,
+                reason="",
+                j_from_i=estimate.j_from_i,
+                inlier_ratio=estimate.inlier_ratio,
+                median_relative_residual=estimate.median_relative_residual,
+                information=estimate.information,
+                point_count=estimate.point_count,
+                attempts=tuple(attempts),
+            )
+    reason = "; ".join(f"{attempt.anchor}: {attempt.outcome}" for attempt in attempts)
+    return Constraint(
+        spec=spec,
+        accepted=False,
+        reason=reason or "no keyframe is registered in both submaps",
+        j_from_i=Sim3.identity(),
+        inlier_ratio=max((attempt.inlier_ratio for attempt in attempts), default=0.0),
+        median_relative_residual=float("nan"),
+        information=np.zeros((7, 7)),
+        point_count=0,
+        attempts=tuple(attempts),
+    )
+
+
+def _ladder(
+    spec: RegistrationSpec, shared: Sequence[SharedFrame], first: str
+) -> list[tuple[str, tuple[SharedFrame, ...]]]:
+    """Anchors from the configured one to the whole overlap, each set of frames once."""
+    place = {keyframe_id: position for position, keyframe_id in enumerate(spec.shared_keyframe_ids)}
+    middle = len(spec.shared_keyframe_ids) // 2
+    # where the middle frame itself is not registered on both sides, the nearest one takes its place
+    nearest = sorted(shared, key=lambda frame: (abs(place[frame.keyframe_id] - middle), place[frame.keyframe_id]))
+    names = list(_WINDOWS)
+    ladder: list[tuple[str, tuple[SharedFrame, ...]]] = []
+    for name in names[names.index(first) :]:
+        size = _WINDOWS[name]
+        chosen = tuple(sorted(nearest[:size], key=lambda frame: place[frame.keyframe_id]))
+        if chosen and (not ladder or len(chosen) > len(ladder[-1][1])):
+            ladder.append((name, chosen))
+    return ladder
+
+
+def _estimate(
+    frames: Sequence[SharedFrame], shared: Sequence[SharedFrame], config: RegistrationConfig, *, fix_scale: bool
+) -> Sim3Estimate:
+    # 1. pixels that both sides trust
+    masks = [_valid_pixels(frame, config) for frame in frames]
+    if sum(int(mask.sum()) for mask in masks) < config.min_points:
+        raise RegistrationError(f"{sum(int(m.sum()) for m in masks)} valid pixels, {config.min_points} are needed")
+    depth_i = np.concatenate([frame.in_i.depth[mask] for frame, mask in zip(frames, masks, strict=True)])
+    depth_j = np.concatenate([frame.in_j.depth[mask] for frame, mask in zip(frames, masks, strict=True)])
+    rays = [(_rays(frame.in_i, mask), _rays(frame.in_j, mask)) for frame, mask in zip(frames, masks, strict=True)]
+    _check_view(depth_i, depth_j, np.concatenate([rays_j for _, rays_j in rays]), shared)
+    # 2. a robust start: rotation of the shared cameras, median depth ratio
+    scale = 1.0 if fix_scale else float(np.median(depth_j / depth_i))
+    rotation = camera_rotation(shared)
+    start = _start(frames, rotation, scale)
+    # 3. the same pixel is the same point
+    points_i, points_j = (
+        np.concatenate(
+            [
+                se3.act(view.submap_from_camera, view_rays[side] * view.depth[mask].astype(np.float64)[:, None])
+                for view, view_rays, mask in zip(views, rays, masks, strict=True)
+            ]
+        )
+        for side, views in enumerate(([f.in_i for f in frames], [f.in_j for f in frames]))
+    )
+    # Both depths err; dividing by one of them would favour the points that this side happens to see too near, and
+    # pull the scale by the variance of the noise, at every edge in the same direction.
+    depth = np.sqrt(scale * depth_i.astype(np.float64) * depth_j)
+    weights = np.ones(len(depth), dtype=np.float32)
+    estimate = estimate_sim3(
+        points_i, points_j, weights, depth, start, config, fix_scale=fix_scale, frame_count=len(frames)
+    )
+    # 4. the cameras are witnesses too
+    turned = float(np.linalg.norm(se3.so3_log(estimate.j_from_i.rotation @ rotation.T)))
+    if turned > _MAX_DISAGREEMENT_RAD:
+        raise RegistrationError(f"points and cameras disagree by {np.degrees(turned):.0f} degrees")
+    return estimate
+
+
+def _valid_pixels(frame: SharedFrame, config: RegistrationConfig) -> npt.NDArray[np.bool_]:
+    """Pixels (H, W) that both sides know and trust (paper eq. 9); sky has no confidence."""
+    if frame.in_i.depth.shape != frame.in_j.depth.shape:
+        raise RegistrationError(f"the point maps of {frame.keyframe_id} have different sizes")
+    with np.errstate(invalid="ignore"):
+        confidence = np.minimum(frame.in_i.confidence, frame.in_j.confidence)
+        known = (confidence > 0.0) & (frame.in_i.depth > 0.0) & (frame.in_j.depth > 0.0)
+    known &= np.isfinite(frame.in_i.depth) & np.isfinite(frame.in_j.depth) & np.isfinite(confidence)
+    return known & (confidence >= _threshold(confidence[known], config))
+
+
+def _threshold(confidence: npt.NDArray[np.float32], config: RegistrationConfig) -> float:
+    """The lowest confidence to use, from those of all known pixels of an anchor."""
+    if confidence.size == 0:
+        return 1.0
+    match config.confidence_mode:
+        case "quantile":
+            return float(np.quantile(confidence, min(config.confidence_value, 1.0)))
+        case "mean_coef":
+            return config.confidence_value * float(confidence.mean(dtype=np.float64))
+        case "median_coef":
+            return config.confidence_value * float(np.median(confidence))
+        case "absolute":
+            return config.confidence_value
+
+
+def _rays(view: AnchorView, mask: npt.NDArray[np.bool_]) -> Array:
+    return pixel_rays(view.intrinsics)[mask]
+
+
+def _check_view(
+    depth_i: npt.NDArray[np.float32], depth_j: npt.NDArray[np.float32], rays: Array, shared: Sequence[SharedFrame]
+) -> None:
+    """Refuse what gives a consistent but worthless transform.
+
+    Raises:
+        RegistrationError: the pixels lie along a line in the image, all depths are one, or all points are so far away
+            that their depth is not seen.
+    """
+    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(rays[:, :2].T))[0].clip(0.0)))
+    if spread < _MIN_RAY_SPREAD:
+        raise RegistrationError("the valid pixels lie along a line in the image")
+    for depth in (depth_i, depth_j):
+        low, high = np.quantile(depth, [0.1, 0.9])
+        if float(np.log(high / low)) < _MIN_LOG_DEPTH_SPREAD:
+            raise RegistrationError("all points are at one depth")
+    if len(shared) >= _MIN_BASELINE_FRAMES:
+        for side, depth in (("in_i", depth_i), ("in_j", depth_j)):
+            centres = np.array([getattr(frame, side).submap_from_camera[:3, 3] for frame in shared])
+            baseline = float(np.linalg.norm(centres - centres[0], axis=1).max())
+            if float(np.median(depth)) > _MAX_DEPTH_OVER_BASELINE * baseline:
+                raise RegistrationError(
+                    "all points are far: the cameras of the overlap hardly move against their depth"
+                )
+
+
+def camera_rotation(shared: Sequence[SharedFrame]) -> Array:
+    """Rotation (3, 3) of ``j_from_i`` from the cameras of all shared frames: their chordal mean."""
+    total = np.zeros((3, 3))
+    for frame in shared:
+        total += frame.in_j.submap_from_camera[:3, :3] @ frame.in_i.submap_from_camera[:3, :3].T
+    return se3.nearest_rotation(total)
+
+
+def _start(frames: Sequence[SharedFrame], rotation: Array, scale: float) -> Sim3:
+    """Similarity of given rotation and scale that takes the anchors' camera centres onto each other, on average."""
+    centre_i = np.mean([frame.in_i.submap_from_camera[:3, 3] for frame in frames], axis=0)
+    centre_j = np.mean([frame.in_j.submap_from_camera[:3, 3] for frame in frames], axis=0)
+    return Sim3(rotation, centre_j - scale * (rotation @ centre_i), scale)
