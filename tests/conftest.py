@@ -6,9 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA_VARIABLE = "VGGT_MOTION_DATA"
+
+# No timed assertions: a busy machine is not a defect.
+settings.register_profile("vggt_motion", deadline=None)
+settings.load_profile("vggt_motion")
 
 
 def evaluation_data() -> Path:

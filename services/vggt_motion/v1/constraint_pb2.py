@@ -26,15 +26,15 @@ from vggt_motion.v1 import common_pb2 as vggt__motion_dot_v1_dot_common__pb2
 from vggt_motion.v1 import submap_pb2 as vggt__motion_dot_v1_dot_submap__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fvggt_motion/v1/constraint.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\x1a\x1bvggt_motion/v1/submap.proto\"\xb3\x01\n\x10RegistrationSpec\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\t\n\x01i\x18\x02 \x01(\x04\x12\t\n\x01j\x18\x03 \x01(\x04\x12\x12\n\ni_revision\x18\x04 \x01(\r\x12\x12\n\nj_revision\x18\x05 \x01(\r\x12,\n\x04kind\x18\x06 \x01(\x0e\x32\x1e.vggt_motion.v1.ConstraintKind\x12\x1b\n\x13shared_keyframe_ids\x18\x07 \x03(\t\"\x99\x01\n\x13RegistrationAttempt\x12\x0e\n\x06\x61nchor\x18\x01 \x01(\t\x12\x14\n\x0ckeyframe_ids\x18\x02 \x03(\t\x12\x13\n\x0bpoint_count\x18\x03 \x01(\x04\x12\x14\n\x0cinlier_ratio\x18\x04 \x01(\x01\x12 \n\x18median_relative_residual\x18\x05 \x01(\x01\x12\x0f\n\x07outcome\x18\x06 \x01(\t\"\xb7\x02\n\nConstraint\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12.\n\x04spec\x18\x02 \x01(\x0b\x32 .vggt_motion.v1.RegistrationSpec\x12\x10\n\x08\x61\x63\x63\x65pted\x18\x03 \x01(\x08\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12&\n\x08j_from_i\x18\x05 \x01(\x0b\x32\x14.vggt_motion.v1.Sim3\x12\x14\n\x0cinlier_ratio\x18\x06 \x01(\x01\x12 \n\x18median_relative_residual\x18\x07 \x01(\x01\x12\x13\n\x0binformation\x18\x08 \x03(\x01\x12\x13\n\x0bpoint_count\x18\t \x01(\x04\x12\x35\n\x08\x61ttempts\x18\n \x03(\x0b\x32#.vggt_motion.v1.RegistrationAttempt\"j\n\x0eSharedGeometry\x12+\n\x04in_i\x18\x01 \x01(\x0b\x32\x1d.vggt_motion.v1.FrameGeometry\x12+\n\x04in_j\x18\x02 \x01(\x0b\x32\x1d.vggt_motion.v1.FrameGeometry\"\x81\x01\n\x0cRegisterTask\x12.\n\x04spec\x18\x01 \x01(\x0b\x32 .vggt_motion.v1.RegistrationSpec\x12.\n\x06shared\x18\x02 \x03(\x0b\x32\x1e.vggt_motion.v1.SharedGeometry\x12\x11\n\tfix_scale\x18\x03 \x01(\x08*i\n\x0e\x43onstraintKind\x12\x1f\n\x1b\x43ONSTRAINT_KIND_UNSPECIFIED\x10\x00\x12\x1c\n\x18\x43ONSTRAINT_KIND_ADJACENT\x10\x01\x12\x18\n\x14\x43ONSTRAINT_KIND_LOOP\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fvggt_motion/v1/constraint.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\x1a\x1bvggt_motion/v1/submap.proto\"\xb3\x01\n\x10RegistrationSpec\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\t\n\x01i\x18\x02 \x01(\x04\x12\t\n\x01j\x18\x03 \x01(\x04\x12\x12\n\ni_revision\x18\x04 \x01(\r\x12\x12\n\nj_revision\x18\x05 \x01(\r\x12,\n\x04kind\x18\x06 \x01(\x0e\x32\x1e.vggt_motion.v1.ConstraintKind\x12\x1b\n\x13shared_keyframe_ids\x18\x07 \x03(\t\"\x99\x01\n\x13RegistrationAttempt\x12\x0e\n\x06\x61nchor\x18\x01 \x01(\t\x12\x14\n\x0ckeyframe_ids\x18\x02 \x03(\t\x12\x13\n\x0bpoint_count\x18\x03 \x01(\x04\x12\x14\n\x0cinlier_ratio\x18\x04 \x01(\x01\x12 \n\x18median_relative_residual\x18\x05 \x01(\x01\x12\x0f\n\x07outcome\x18\x06 \x01(\t\"\xb7\x02\n\nConstraint\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12.\n\x04spec\x18\x02 \x01(\x0b\x32 .vggt_motion.v1.RegistrationSpec\x12\x10\n\x08\x61\x63\x63\x65pted\x18\x03 \x01(\x08\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12&\n\x08j_from_i\x18\x05 \x01(\x0b\x32\x14.vggt_motion.v1.Sim3\x12\x14\n\x0cinlier_ratio\x18\x06 \x01(\x01\x12 \n\x18median_relative_residual\x18\x07 \x01(\x01\x12\x13\n\x0binformation\x18\x08 \x03(\x01\x12\x13\n\x0bpoint_count\x18\t \x01(\x04\x12\x35\n\x08\x61ttempts\x18\n \x03(\x0b\x32#.vggt_motion.v1.RegistrationAttempt\"j\n\x0eSharedGeometry\x12+\n\x04in_i\x18\x01 \x01(\x0b\x32\x1d.vggt_motion.v1.FrameGeometry\x12+\n\x04in_j\x18\x02 \x01(\x0b\x32\x1d.vggt_motion.v1.FrameGeometry\"\x99\x01\n\x0cRegisterTask\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12.\n\x04spec\x18\x02 \x01(\x0b\x32 .vggt_motion.v1.RegistrationSpec\x12.\n\x06shared\x18\x03 \x03(\x0b\x32\x1e.vggt_motion.v1.SharedGeometry\x12\x11\n\tfix_scale\x18\x04 \x01(\x08*i\n\x0e\x43onstraintKind\x12\x1f\n\x1b\x43ONSTRAINT_KIND_UNSPECIFIED\x10\x00\x12\x1c\n\x18\x43ONSTRAINT_KIND_ADJACENT\x10\x01\x12\x18\n\x14\x43ONSTRAINT_KIND_LOOP\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'vggt_motion.v1.constraint_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CONSTRAINTKIND']._serialized_start=1001
-  _globals['_CONSTRAINTKIND']._serialized_end=1106
+  _globals['_CONSTRAINTKIND']._serialized_start=1025
+  _globals['_CONSTRAINTKIND']._serialized_end=1130
   _globals['_REGISTRATIONSPEC']._serialized_start=110
   _globals['_REGISTRATIONSPEC']._serialized_end=289
   _globals['_REGISTRATIONATTEMPT']._serialized_start=292
@@ -44,5 +44,5 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_SHAREDGEOMETRY']._serialized_start=761
   _globals['_SHAREDGEOMETRY']._serialized_end=867
   _globals['_REGISTERTASK']._serialized_start=870
-  _globals['_REGISTERTASK']._serialized_end=999
+  _globals['_REGISTERTASK']._serialized_end=1023
 # @@protoc_insertion_point(module_scope)

@@ -84,11 +84,13 @@ class SharedGeometry(_message.Message):
     def __init__(self, in_i: _Optional[_Union[_submap_pb2.FrameGeometry, _Mapping]] = ..., in_j: _Optional[_Union[_submap_pb2.FrameGeometry, _Mapping]] = ...) -> None: ...
 
 class RegisterTask(_message.Message):
-    __slots__ = ("spec", "shared", "fix_scale")
+    __slots__ = ("schema_version", "spec", "shared", "fix_scale")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     SPEC_FIELD_NUMBER: _ClassVar[int]
     SHARED_FIELD_NUMBER: _ClassVar[int]
     FIX_SCALE_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
     spec: RegistrationSpec
     shared: _containers.RepeatedCompositeFieldContainer[SharedGeometry]
     fix_scale: bool
-    def __init__(self, spec: _Optional[_Union[RegistrationSpec, _Mapping]] = ..., shared: _Optional[_Iterable[_Union[SharedGeometry, _Mapping]]] = ..., fix_scale: bool = ...) -> None: ...
+    def __init__(self, schema_version: _Optional[int] = ..., spec: _Optional[_Union[RegistrationSpec, _Mapping]] = ..., shared: _Optional[_Iterable[_Union[SharedGeometry, _Mapping]]] = ..., fix_scale: bool = ...) -> None: ...

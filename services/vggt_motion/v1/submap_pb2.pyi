@@ -143,9 +143,11 @@ class SubmapGeometry(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., spec: _Optional[_Union[SubmapSpec, _Mapping]] = ..., verdict: _Optional[_Union[SubmapVerdict, str]] = ..., reason: _Optional[str] = ..., scale_kind: _Optional[_Union[ScaleKind, str]] = ..., model: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[FrameGeometry, _Mapping]]] = ..., quality: _Optional[_Union[SubmapQuality, _Mapping]] = ..., stage_seconds: _Optional[_Mapping[str, float]] = ...) -> None: ...
 
 class PredictTask(_message.Message):
-    __slots__ = ("spec", "keyframes")
+    __slots__ = ("schema_version", "spec", "keyframes")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     SPEC_FIELD_NUMBER: _ClassVar[int]
     KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
     spec: SubmapSpec
     keyframes: _containers.RepeatedCompositeFieldContainer[_keyframe_pb2.Keyframe]
-    def __init__(self, spec: _Optional[_Union[SubmapSpec, _Mapping]] = ..., keyframes: _Optional[_Iterable[_Union[_keyframe_pb2.Keyframe, _Mapping]]] = ...) -> None: ...
+    def __init__(self, schema_version: _Optional[int] = ..., spec: _Optional[_Union[SubmapSpec, _Mapping]] = ..., keyframes: _Optional[_Iterable[_Union[_keyframe_pb2.Keyframe, _Mapping]]] = ...) -> None: ...
