@@ -1,0 +1,221 @@
+"""Blobs as files named by their content: ``blobs/ab/abcdef...``.
+
+A blob is written under ``blobs/incoming``, forced to the disk, renamed to its name and its folder forced to the disk;
+only then does a row refer to it. So a name under ``blobs/ab`` always stands for whole content, whatever was killed;
+what was torn is under ``incoming`` and is removed at the next start. The hash is verified on every read, because disks
+do rot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import itertools
+import logging
+import os
+import re
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from vggt_motion.errors import DiskFullError, LedgerError
+from vggt_motion.ledger.store import BlobEntry, DamagedBlobError, InvalidRequestError, UnknownError, reserve_line
+
+_LOGGER = logging.getLogger(__name__)
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class FileOperations:
+    """The file operations that durability rests on, apart so that tests can record them and let them fail."""
+
+    def write_and_sync(self, path: Path, data: bytes) -> None:
+        """Create a file with this content and force it to the disk."""
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        try:
+            view = memoryview(data)
+            while view:
+                view = view[os.write(descriptor, view) :]
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def rename(self, source: Path, target: Path) -> None:
+        """Move a file within the file system, atomically; replaces ``target``."""
+        source.replace(target)
+
+    def sync_folder(self, folder: Path) -> None:
+        """Force the entries of a folder to the disk."""
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def make_folder(folder: Path, files: FileOperations) -> None:
+    """Create a folder with its parents, durably."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    for path in reversed(missing):
+        path.mkdir(exist_ok=True)
+        files.sync_folder(path.parent)
+
+
+def free_space(folder: Path) -> int:
+    """Bytes that an ordinary process may still write to the file system of ``folder``."""
+    stat = os.statvfs(folder)
+    return stat.f_bavail * stat.f_frsize
+
+
+def sha256_hex(data: bytes) -> str:
+    """SHA-256 as 64 lower-case hexadecimal digits."""
+    return hashlib.sha256(data).hexdigest()
+
+
+class BlobFiles:
+    """Blob store in a folder; safe for use from many threads. One process at a time (the session's lock sees to it)."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        free_bytes: Callable[[], int] | None = None,
+        files: FileOperations | None = None,
+    ) -> None:
+        """Open or create the store and remove what an interrupted write left.
+
+        Args:
+            folder: where the files are.
+            free_bytes: space left in bytes; defaults to asking the file system.
+            files: the file operations; defaults to the real ones.
+
+        Raises:
+            LedgerError: the folder cannot be created or written.
+        """
+        self._folder = folder
+        self._incoming = folder / "incoming"
+        self._damaged = folder / "damaged"
+        self._files = files or FileOperations()
+        self._free_bytes = free_bytes or (lambda: free_space(folder))
+        self._counter = itertools.count()
+        self._lock = threading.Lock()
+        self._claimed_bytes = 0  # of writes that are under way: many at once must not overshoot the reserve together
+        try:
+            make_folder(self._incoming, self._files)
+            # All of them now: a later one would have to be forced to the disk by every thread that uses it.
+            for prefix in range(256):
+                (folder / f"{prefix:02x}").mkdir(exist_ok=True)
+            self._files.sync_folder(folder)
+            for leftover in self._incoming.iterdir():
+                leftover.unlink()
+        except OSError as error:
+            raise LedgerError(f"cannot use {folder} for blobs: {error.strerror or error}") from error
+
+    def put(self, blobs: Sequence[bytes], *, keep_free_bytes: int) -> list[BlobEntry]:
+        """Make blobs durable, in order; see :meth:`.store.Blobs.put`."""
+        entries = [BlobEntry(sha256_hex(data), len(data)) for data in blobs]
+        # An existing file is read again: that its name is there does not say that the disk kept its content.
+        missing = {
+            entry.sha256: data
+            for entry, data in zip(entries, blobs, strict=True)
+            if not self._is_sound(entry.sha256, entry.size_bytes)
+        }
+        size_bytes = sum(map(len, missing.values()))
+        with self._space(size_bytes, keep_free_bytes):
+            try:
+                for sha256, data in missing.items():
+                    self._write(sha256, data)
+                # Also for known blobs: another thread, or a process that was killed, may have renamed them only.
+                for folder in sorted({self._path(entry.sha256).parent for entry in entries}):
+                    self._files.sync_folder(folder)
+            except OSError as error:
+                if error.errno in _NO_SPACE:
+                    raise DiskFullError(f"no space for {size_bytes} bytes in {self._folder}") from error
+                raise LedgerError(f"cannot write to {self._folder}: {error.strerror or error}") from error
+        return entries
+
+    def get(self, sha256: str) -> bytes:
+        """The bytes, verified; see :meth:`.store.Blobs.get`. Damaged ones are set aside; appending heals them."""
+        path = self._path(sha256)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            raise UnknownError(f"no blob {sha256}") from None
+        except OSError as error:
+            raise LedgerError(f"cannot read blob {sha256}: {error.strerror or error}") from error
+        if sha256_hex(data) != sha256:
+            self.set_aside(sha256)
+            raise DamagedBlobError(f"blob {sha256} is damaged: {len(data)} bytes with another hash")
+        return data
+
+    def has(self, sha256: str, size_bytes: int) -> bool:
+        """Whether the file is there with this size."""
+        try:
+            return self._path(sha256).stat().st_size == size_bytes
+        except OSError:
+            return False
+
+    def free_bytes(self) -> int:
+        """Space left in bytes."""
+        return self._free_bytes()
+
+    def names(self) -> Iterator[str]:
+        """SHA-256 of every stored file, in order, whether a record refers to it or not."""
+        for folder in sorted(path for path in self._folder.iterdir() if re.fullmatch(r"[0-9a-f]{2}", path.name)):
+            for path in sorted(folder.iterdir()):
+                if _SHA256.fullmatch(path.name) and path.name.startswith(folder.name):
+                    yield path.name
+
+    def remove(self, sha256: str) -> int:
+        """Delete a file that no record refers to; returns its size in bytes."""
+        path = self._path(sha256)
+        size_bytes = path.stat().st_size
+        path.unlink()
+        return size_bytes
+
+    def set_aside(self, sha256: str) -> None:
+        """Move a damaged file to ``damaged/``, where a person can look at it."""
+        path = self._path(sha256)
+        _LOGGER.error("blob %s is damaged; moved to %s", sha256, self._damaged)
+        with contextlib.suppress(OSError):
+            make_folder(self._damaged, self._files)
+            self._files.rename(path, self._damaged / sha256)
+
+    def _path(self, sha256: str) -> Path:
+        # The name comes from outside: it must never lead out of the folder.
+        if not _SHA256.fullmatch(sha256):
+            raise InvalidRequestError(f"'{sha256[:80]}' is not a SHA-256 in lower-case hexadecimal digits")
+        return self._folder / sha256[:2] / sha256
+
+    def _is_sound(self, sha256: str, size_bytes: int) -> bool:
+        if not self.has(sha256, size_bytes):
+            return False
+        try:
+            return sha256_hex(self._path(sha256).read_bytes()) == sha256
+        except OSError:
+            return False
+
+    def _write(self, sha256: str, data: bytes) -> None:
+        target = self._path(sha256)
+        temporary = self._incoming / f"{sha256}.{next(self._counter)}"
+        try:
+            self._files.write_and_sync(temporary, data)
+            self._files.rename(temporary, target)
+        except OSError:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+
+    @contextlib.contextmanager
+    def _space(self, size_bytes: int, keep_free_bytes: int) -> Iterator[None]:
+        with self._lock:
+            free_bytes = self.free_bytes()
+            if free_bytes - self._claimed_bytes - size_bytes < keep_free_bytes:
+                raise DiskFullError(reserve_line(free_bytes, keep_free_bytes))
+            self._claimed_bytes += size_bytes
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._claimed_bytes -= size_bytes

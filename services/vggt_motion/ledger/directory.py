@@ -1,0 +1,137 @@
+"""One session's directory: the lock, the database and the blobs, opened and closed as one.
+
+DIR/session.lock   held exclusively by the process that serves the session
+DIR/ledger.db      rows (and ledger.db-wal, ledger.db-shm while it is open)
+DIR/blobs/         payloads by their hash
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from vggt_motion.errors import LedgerError
+from vggt_motion.ledger.blobs import BlobFiles, FileOperations, make_folder
+from vggt_motion.ledger.jobs import JobPolicy, JobQueue
+from vggt_motion.ledger.log import Store
+from vggt_motion.ledger.sqlite import SqliteRows
+from vggt_motion.ledger.store import NewRecord
+from vggt_motion.records import JobReport
+
+DATABASE_NAME: Final = "ledger.db"
+LOCK_NAME: Final = "session.lock"
+BLOBS_NAME: Final = "blobs"
+
+
+class SessionLock:
+    """The exclusive right to a session's directory; ends with the process at the latest, however it ends."""
+
+    def __init__(self, directory: Path) -> None:
+        """Take the lock.
+
+        Raises:
+            LedgerError: another process has it, or the directory cannot be written.
+        """
+        path = directory / LOCK_NAME
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise LedgerError(f"cannot write to {directory}: {error.strerror or error}") from error
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
+            os.close(self._descriptor)
+            raise LedgerError(f"{directory} is in use by another process ({holder or 'unknown'})") from error
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Give the lock back."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+@contextlib.contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Hold a session's directory for a while."""
+    lock = SessionLock(directory)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class Ledger:
+    """An open session: ``store``, ``jobs`` and ``blobs`` on one directory, under its lock."""
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        reserve_bytes: int = 0,
+        input_streams: Collection[str] = (),
+        policy: JobPolicy | None = None,
+        result_streams: Mapping[str, str],
+        dead_event: Callable[[JobReport], NewRecord],
+        free_bytes: Callable[[], int] | None = None,
+        files: FileOperations | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        time_ns: Callable[[], int] = time.time_ns,
+        new_lease_id: Callable[[], str] | None = None,
+    ) -> None:
+        """Open or create a session; what was leased is open again.
+
+        Args:
+            directory: created if it is not there.
+            reserve_bytes: see :class:`.log.Store`.
+            input_streams: see :class:`.log.Store`.
+            policy: see :class:`.jobs.JobQueue`.
+            result_streams: see :class:`.jobs.JobQueue`.
+            dead_event: see :class:`.jobs.JobQueue`.
+            free_bytes: space left in bytes; defaults to asking the file system.
+            files: the file operations of the blobs; defaults to the real ones.
+            clock: seconds, monotonic.
+            time_ns: wall clock, informative.
+            new_lease_id: see :class:`.jobs.JobQueue`.
+
+        Raises:
+            LedgerError: in use by another process, damaged, of a newer schema, or not writable.
+        """
+        self.directory = directory
+        with contextlib.ExitStack() as undo:
+            files = files or FileOperations()
+            try:
+                make_folder(directory, files)
+            except OSError as error:
+                raise LedgerError(f"cannot create {directory}: {error.strerror or error}") from error
+            lock = SessionLock(directory)
+            undo.callback(lock.release)
+            self.blobs = BlobFiles(directory / BLOBS_NAME, free_bytes=free_bytes, files=files)
+            self.rows = SqliteRows(directory / DATABASE_NAME)
+            undo.callback(self.rows.close)
+            files.sync_folder(directory)
+            self.store = Store(
+                self.rows, self.blobs, reserve_bytes=reserve_bytes, input_streams=input_streams, time_ns=time_ns
+            )
+            self.jobs = JobQueue(
+                self.rows,
+                self.store,
+                policy=policy,
+                result_streams=result_streams,
+                dead_event=dead_event,
+                clock=clock,
+                new_lease_id=new_lease_id,
+            )
+            self._close = undo.pop_all()
+
+    def close(self) -> None:
+        """End waiting claims, close the database and give the lock back."""
+        self.jobs.close()
+        self._close.close()

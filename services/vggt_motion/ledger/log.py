@@ -1,0 +1,263 @@
+"""The durable log: streams of records with dense sequence numbers, appended idempotently, and the blobs they refer to.
+
+An append is acknowledged when its blobs and then its row have been forced to the disk. It may be repeated at will: the
+same identity under the same id is acknowledged again with the same sequence number, another identity is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+from vggt_motion.errors import DiskFullError
+from vggt_motion.ledger.store import (
+    BlobEntry,
+    Blobs,
+    ConflictError,
+    InvalidRequestError,
+    NewRecord,
+    Reader,
+    RecordRow,
+    Rows,
+    Transaction,
+    UnknownError,
+    reserve_line,
+)
+
+MAX_RECORD_ID_BYTES = 256
+MAX_PAYLOAD_TYPE_BYTES = 128
+MAX_PAYLOAD_BYTES = 32 * 2**20
+MAX_BLOBS_PER_RECORD = 4096
+MAX_READ_RECORDS = 1000
+MAX_READ_BYTES = 8 * 2**20
+IDENTITY_BYTES = 32
+
+_STREAM = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_IDENTIFIER = re.compile(r"[!-~]+")
+
+
+@dataclass(frozen=True)
+class Appended:
+    """Acknowledgement of a durable record."""
+
+    sequence: int  # dense per stream, from 0
+    was_known: bool
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Bytes of a session on disk."""
+
+    row_bytes: int
+    blob_bytes: int
+    free_bytes: int
+
+
+class Store:
+    """The log of one session. Thread-safe; may block for a disk."""
+
+    def __init__(
+        self,
+        rows: Rows,
+        blobs: Blobs,
+        *,
+        reserve_bytes: int = 0,
+        input_streams: Collection[str] = (),
+        time_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Put the log's rules on top of rows and blobs.
+
+        Args:
+            rows: durable rows.
+            blobs: durable blobs.
+            reserve_bytes: free bytes below which new input is refused; everything else may use half of them.
+            input_streams: the streams that bring new input, and with it more work and more data.
+            time_ns: wall clock, informative.
+        """
+        self._rows = rows
+        self._blobs = blobs
+        self._reserve_bytes = reserve_bytes
+        self._input_streams = frozenset(input_streams)
+        self._time_ns = time_ns
+
+    def append(self, record: NewRecord, blobs: Sequence[bytes] = (), references: Sequence[BlobEntry] = ()) -> Appended:
+        """Make a record durable, with its blobs.
+
+        Args:
+            record: the record; the payload is opaque.
+            blobs: new blobs that travel with it.
+            references: the blobs that it refers to; each must be among ``blobs`` or stored already.
+
+        Raises:
+            InvalidRequestError: malformed or out of bounds.
+            ConflictError: the id is known with another identity.
+            UnknownError: a reference to a blob that is neither here nor stored.
+            DiskFullError: not enough space; nothing was changed.
+        """
+        check_record(record)
+        known = self._rows.read(lambda reader: self._find_known(reader, record))
+        if known is not None and self._has_all(known.stream, known.sequence):
+            return Appended(known.sequence, was_known=True)
+        entries = self.put_blobs(blobs, references, is_input=record.stream in self._input_streams)
+        return self._rows.write(lambda transaction: self.add(transaction, record, entries))
+
+    def put_blobs(self, blobs: Sequence[bytes], references: Sequence[BlobEntry], *, is_input: bool) -> list[BlobEntry]:
+        """Make the blobs of a record durable before its row; returns every blob that the record refers to."""
+        if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
+            raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")
+        keep_free_bytes = self._reserve_bytes if is_input else self._reserve_bytes // 2
+        free_bytes = self._blobs.free_bytes()
+        if free_bytes < keep_free_bytes:
+            raise DiskFullError(reserve_line(free_bytes, keep_free_bytes))
+        entries = self._blobs.put(blobs, keep_free_bytes=keep_free_bytes) if blobs else []
+        brought = {entry.sha256: entry.size_bytes for entry in entries}
+        for reference in references:
+            if reference.sha256 in brought:
+                is_there = brought[reference.sha256] == reference.size_bytes
+            else:
+                is_there = self._blobs.has(reference.sha256, reference.size_bytes)
+            if not is_there:
+                raise UnknownError(
+                    f"no blob {reference.sha256} of {reference.size_bytes} bytes, to which the record refers"
+                )
+        return sorted({*entries, *references}, key=lambda entry: entry.sha256)
+
+    def add(self, transaction: Transaction, record: NewRecord, blobs: Sequence[BlobEntry] = ()) -> Appended:
+        """Append within a larger change; the record must be checked and its blobs durable already."""
+        known = self._find_known(transaction, record)
+        if known is not None:
+            return Appended(known.sequence, was_known=True)
+        sequence = transaction.next_sequence(record.stream)
+        time_ns = self._time_ns()
+        row = RecordRow(
+            stream=record.stream,
+            sequence=sequence,
+            record_id=record.record_id,
+            payload_type=record.payload_type,
+            payload=record.payload,
+            identity_sha256=record.identity_sha256,
+            append_time_ns=time_ns,
+            row_sha256=row_digest(record, sequence, time_ns),
+        )
+        transaction.add_record(row, blobs)
+        return Appended(sequence, was_known=False)
+
+    def read(self, stream: str, from_sequence: int = 0, limit: int = 0) -> list[RecordRow]:
+        """Records ``from_sequence``, ``from_sequence + 1``, ... in order; empty only at the end of the stream.
+
+        Args:
+            stream: name of the stream; one without records is empty.
+            from_sequence: first sequence number.
+            limit: at most so many, 0 = as many as allowed; fewer come back when they are large.
+
+        Raises:
+            InvalidRequestError: malformed or out of bounds.
+        """
+        check_stream(stream)
+        if not 0 <= from_sequence < 2**63 or limit < 0:
+            raise InvalidRequestError("from_sequence and limit must not be negative")
+        count = min(limit or MAX_READ_RECORDS, MAX_READ_RECORDS)
+        return self._rows.read(lambda reader: list(bounded_records(reader, stream, from_sequence, count)))
+
+    def blob(self, sha256: str) -> bytes:
+        """The bytes of a blob, verified; see :meth:`.store.Blobs.get`."""
+        return self._blobs.get(sha256)
+
+    def positions(self) -> dict[str, int]:
+        """Next sequence number of every stream that has records."""
+        return self._rows.read(lambda reader: dict(reader.positions()))
+
+    def sizes(self) -> Sizes:
+        """Bytes on disk."""
+        blob_bytes = self._rows.read(lambda reader: reader.blob_bytes())
+        return Sizes(self._rows.size_bytes(), blob_bytes, self._blobs.free_bytes())
+
+    @property
+    def is_accepting(self) -> bool:
+        """Whether there is space for new input."""
+        return self._blobs.free_bytes() >= self._reserve_bytes
+
+    def _find_known(self, reader: Reader, record: NewRecord) -> RecordRow | None:
+        known = reader.find_record(record.stream, record.record_id)
+        if known is not None and known.identity_sha256 != record.identity_sha256:
+            raise ConflictError(
+                f"{record.stream} record '{record.record_id}' is known with another content (sequence {known.sequence})"
+            )
+        return known
+
+    def _has_all(self, stream: str, sequence: int) -> bool:
+        # A blob that was damaged and set aside comes back with a repeated append.
+        entries = self._rows.read(lambda reader: reader.record_blobs(stream, sequence))
+        return all(self._blobs.has(entry.sha256, entry.size_bytes) for entry in entries)
+
+
+def bounded_records(reader: Reader, stream: str, from_sequence: int, count: int) -> Sequence[RecordRow]:
+    """Up to ``count`` records and, but for the first, up to ``MAX_READ_BYTES`` of payload."""
+    rows: list[RecordRow] = []
+    size_bytes = 0
+    while len(rows) < count:
+        # In small steps, so that a few large records do not pull hundreds of others into memory with them.
+        step = reader.records(stream, from_sequence + len(rows), min(32, count - len(rows)))
+        for row in step:
+            size_bytes += len(row.payload)
+            if rows and size_bytes > MAX_READ_BYTES:
+                return rows
+            rows.append(row)
+        if not step:
+            return rows
+    return rows
+
+
+def check_stream(stream: str) -> None:
+    """Refuse a name that no stream can have."""
+    if not _STREAM.fullmatch(stream):
+        raise InvalidRequestError(f"'{stream[:40]!s}' is not the name of a stream")
+
+
+def check_id(name: str, value: str, max_bytes: int = MAX_RECORD_ID_BYTES) -> None:
+    """Refuse an id that is empty, too long or more than printable ASCII without blanks."""
+    if len(value) > max_bytes or not _IDENTIFIER.fullmatch(value):
+        raise InvalidRequestError(f"{name} must be 1 to {max_bytes} characters of printable ASCII without blanks")
+
+
+def check_record(record: NewRecord) -> None:
+    """Refuse what is malformed or out of bounds.
+
+    Raises:
+        InvalidRequestError: one line that names the field.
+    """
+    check_stream(record.stream)
+    check_id("record_id", record.record_id)
+    check_id("payload_type", record.payload_type, MAX_PAYLOAD_TYPE_BYTES)
+    if len(record.identity_sha256) != IDENTITY_BYTES:
+        raise InvalidRequestError(
+            f"identity_sha256 must have {IDENTITY_BYTES} bytes, not {len(record.identity_sha256)}"
+        )
+    if len(record.payload) > MAX_PAYLOAD_BYTES:
+        raise InvalidRequestError(f"a payload of {len(record.payload)} bytes; at most {MAX_PAYLOAD_BYTES} are allowed")
+
+
+def row_digest(record: NewRecord, sequence: int, append_time_ns: int) -> bytes:
+    """SHA-256 over all fields of a stored record, each with its length before it."""
+    digest = hashlib.sha256()
+    for part in (
+        record.stream.encode(),
+        str(sequence).encode(),
+        record.record_id.encode(),
+        record.payload_type.encode(),
+        record.payload,
+        record.identity_sha256,
+        str(append_time_ns).encode(),
+    ):
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.digest()
+
+
+def is_intact(row: RecordRow) -> bool:
+    """Whether a stored record still has the digest it was stored with."""
+    record = NewRecord(row.stream, row.record_id, row.payload_type, row.payload, row.identity_sha256)
+    return row_digest(record, row.sequence, row.append_time_ns) == row.row_sha256

@@ -1,0 +1,472 @@
+"""Rows in SQLite: write-ahead log, ``synchronous=FULL``, group commit.
+
+Changes that arrive while a commit is under way wait for it and then share the next one: the first of them carries out
+all, each in its savepoint, under one fsync. A lone change pays one fsync and no change of thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import queue
+import sqlite3
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from vggt_motion.errors import DiskFullError, LedgerError, VggtMotionError
+from vggt_motion.ledger.schema import MIGRATIONS, SCHEMA_VERSION
+from vggt_motion.ledger.store import BlobEntry, JobRow, LeaseRow, Reader, RecordRow, Transaction
+from vggt_motion.records import JobState
+
+T = TypeVar("T")
+
+_MAX_READERS = 8
+_WAL_LIMIT_BYTES = 64 * 2**20
+_RECORD_COLUMNS = ", ".join(field.name for field in dataclasses.fields(RecordRow))
+_JOB_COLUMNS = ", ".join(field.name for field in dataclasses.fields(JobRow))
+_JOB_CONTENT = ("job_id", "submission", "kind", "model", "priority", "payload_type", "payload")
+_JOB_PROGRESS = tuple(field.name for field in dataclasses.fields(JobRow) if field.name not in _JOB_CONTENT)
+_LEASE_COLUMNS = ", ".join(field.name for field in dataclasses.fields(LeaseRow))
+
+
+class _Statements:
+    """The statements of :class:`.store.Transaction`, on one connection."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+
+    def find_record(self, stream: str, record_id: str) -> RecordRow | None:
+        row = self._one(f"SELECT {_RECORD_COLUMNS} FROM records WHERE stream = ? AND record_id = ?", stream, record_id)
+        return None if row is None else RecordRow(*row)
+
+    def records(self, stream: str, from_sequence: int, limit: int) -> Sequence[RecordRow]:
+        statement = (
+            f"SELECT {_RECORD_COLUMNS} FROM records WHERE stream = ? AND sequence >= ? ORDER BY sequence LIMIT ?"
+        )
+        return [RecordRow(*row) for row in self._all(statement, stream, from_sequence, limit)]
+
+    def positions(self) -> Mapping[str, int]:
+        return dict(self._all("SELECT stream, next_sequence FROM streams ORDER BY stream"))
+
+    def find_blob(self, sha256: str) -> BlobEntry | None:
+        row = self._one("SELECT sha256, size_bytes FROM blobs WHERE sha256 = ?", sha256)
+        return None if row is None else BlobEntry(*row)
+
+    def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
+        statement = """SELECT blobs.sha256, size_bytes
+            FROM record_blobs JOIN blobs ON blobs.sha256 = record_blobs.sha256
+            WHERE stream = ? AND sequence = ? ORDER BY blobs.sha256"""
+        return [BlobEntry(*row) for row in self._all(statement, stream, sequence)]
+
+    def blob_bytes(self) -> int:
+        return int(self._value("SELECT COALESCE(SUM(size_bytes), 0) FROM blobs"))
+
+    def find_meta(self, key: str) -> str | None:
+        row = self._one("SELECT value FROM meta WHERE key = ?", key)
+        return None if row is None else str(row[0])
+
+    def find_job(self, job_id: str) -> JobRow | None:
+        return self._job(f"SELECT {_JOB_COLUMNS} FROM jobs WHERE job_id = ?", job_id)
+
+    def next_open_job(self, kinds: Collection[str], models: Collection[str], now_s: float) -> JobRow | None:
+        where, values = _offered(kinds, models)
+        order = "ORDER BY priority, submission LIMIT 1"
+        return self._job(f"SELECT {_JOB_COLUMNS} FROM jobs WHERE {where} AND not_before_s <= ? {order}", *values, now_s)
+
+    def next_wake_s(self, kinds: Collection[str], models: Collection[str], now_s: float) -> float | None:
+        where, values = _offered(kinds, models)
+        value = self._value(f"SELECT MIN(not_before_s) FROM jobs WHERE {where} AND not_before_s > ?", *values, now_s)
+        return None if value is None else float(value)
+
+    def leased_jobs(self, worker: str | None = None, deadline_before_s: float | None = None) -> Sequence[JobRow]:
+        statement = f"SELECT {_JOB_COLUMNS} FROM jobs WHERE state = ?"
+        values: list[Any] = [JobState.LEASED.value]
+        if worker is not None:
+            statement += " AND worker = ?"
+            values.append(worker)
+        if deadline_before_s is not None:
+            statement += " AND deadline_s < ?"
+            values.append(deadline_before_s)
+        return [_job(row) for row in self._all(statement + " ORDER BY submission", *values)]
+
+    def find_lease(self, lease_id: str) -> LeaseRow | None:
+        row = self._one(f"SELECT {_LEASE_COLUMNS} FROM leases WHERE lease_id = ?", lease_id)
+        return None if row is None else LeaseRow(*row)
+
+    def find_claim(self, worker: str, claim_id: str) -> LeaseRow | None:
+        row = self._one(
+            f"""SELECT {", ".join("leases." + name for name in _LEASE_COLUMNS.split(", "))}
+            FROM leases JOIN jobs ON jobs.lease_id = leases.lease_id WHERE leases.worker = ? AND leases.claim_id = ?""",
+            worker,
+            claim_id,
+        )
+        return None if row is None else LeaseRow(*row)
+
+    def job_counts(self) -> Mapping[tuple[str, str], int]:
+        rows = self._all("SELECT kind, state, COUNT(*) FROM jobs GROUP BY kind, state ORDER BY kind, state")
+        return {(kind, state): count for kind, state, count in rows}
+
+    def jobs(self, state: str | None, after_job_id: str, limit: int) -> Sequence[JobRow]:
+        statement = f"SELECT {_JOB_COLUMNS} FROM jobs WHERE job_id > ?"
+        values: list[Any] = [after_job_id]
+        if state is not None:
+            statement += " AND state = ?"
+            values.append(state)
+        return [_job(row) for row in self._all(statement + " ORDER BY job_id LIMIT ?", *values, limit)]
+
+    def next_sequence(self, stream: str) -> int:
+        self._run(
+            """INSERT INTO streams (stream, next_sequence) VALUES (?, 1)
+            ON CONFLICT (stream) DO UPDATE SET next_sequence = streams.next_sequence + 1""",
+            stream,
+        )
+        return int(self._value("SELECT next_sequence FROM streams WHERE stream = ?", stream)) - 1
+
+    def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
+        values = dataclasses.astuple(row)
+        self._run(f"INSERT INTO records ({_RECORD_COLUMNS}) VALUES ({_marks(values)})", *values)
+        for blob in sorted(set(blobs), key=lambda blob: blob.sha256):
+            self._run(
+                "INSERT INTO blobs (sha256, size_bytes) VALUES (?, ?) ON CONFLICT (sha256) DO NOTHING",
+                blob.sha256,
+                blob.size_bytes,
+            )
+            self._run(
+                "INSERT INTO record_blobs (stream, sequence, sha256) VALUES (?, ?, ?)",
+                row.stream,
+                row.sequence,
+                blob.sha256,
+            )
+
+    def set_meta(self, key: str, value: str) -> None:
+        self._run(
+            "INSERT INTO meta (key, value) VALUES (?, ?) ON CONFLICT (key) DO UPDATE SET value = excluded.value",
+            key,
+            value,
+        )
+
+    def add_job(self, row: JobRow) -> None:
+        submission = int(self._value("SELECT COALESCE(MAX(submission) + 1, 0) FROM jobs"))
+        values = _values(dataclasses.replace(row, submission=submission))
+        self._run(f"INSERT INTO jobs ({_JOB_COLUMNS}) VALUES ({_marks(values)})", *values)
+
+    def update_job(self, row: JobRow) -> None:
+        assignments = ", ".join(f"{name} = ?" for name in _JOB_PROGRESS)
+        values = [str(value) if isinstance(value := getattr(row, name), JobState) else value for name in _JOB_PROGRESS]
+        self._run(f"UPDATE jobs SET {assignments} WHERE job_id = ?", *values, row.job_id)
+
+    def shift_deadlines(self, seconds: float) -> None:
+        self._run("UPDATE jobs SET deadline_s = deadline_s + ? WHERE state = ?", seconds, JobState.LEASED.value)
+
+    def reset_times(self) -> None:
+        self._run("UPDATE jobs SET not_before_s = 0 WHERE not_before_s <> 0")
+
+    def add_lease(self, row: LeaseRow) -> None:
+        values = dataclasses.astuple(row)
+        self._run(f"INSERT INTO leases ({_LEASE_COLUMNS}) VALUES ({_marks(values)})", *values)
+
+    def _run(self, statement: str, *values: Any) -> None:
+        self._connection.execute(statement, values)
+
+    def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
+        return self._connection.execute(statement, values).fetchall()
+
+    def _one(self, statement: str, *values: Any) -> tuple[Any, ...] | None:
+        row: tuple[Any, ...] | None = self._connection.execute(statement, values).fetchone()
+        return row
+
+    def _value(self, statement: str, *values: Any) -> Any:
+        row = self._one(statement, *values)
+        return None if row is None else row[0]
+
+    def _job(self, statement: str, *values: Any) -> JobRow | None:
+        row = self._one(statement, *values)
+        return None if row is None else _job(row)
+
+
+def _job(row: tuple[Any, ...]) -> JobRow:
+    job = JobRow(*row)
+    return dataclasses.replace(job, state=JobState(job.state))
+
+
+def _values(row: JobRow) -> tuple[Any, ...]:
+    return tuple(str(value) if isinstance(value, JobState) else value for value in dataclasses.astuple(row))
+
+
+def _marks(values: Sequence[Any]) -> str:
+    return ", ".join("?" * len(values))
+
+
+def _offered(kinds: Collection[str], models: Collection[str]) -> tuple[str, list[Any]]:
+    offered_models = sorted({"", *models})
+    where = f"state = ? AND kind IN ({_marks(sorted(kinds))}) AND model IN ({_marks(offered_models)})"
+    return where, [JobState.OPEN.value, *sorted(kinds), *offered_models]
+
+
+class _Pending(Generic[T]):
+    """One change on its way through the group commit."""
+
+    def __init__(self, change: Callable[[Transaction], T]) -> None:
+        self.change = change
+        self.is_finished = False
+        self.result: T
+        self.error: BaseException | None = None
+
+    def run(self, transaction: Transaction) -> None:
+        self.result = self.change(transaction)
+
+
+class SqliteRows:
+    """Rows in one SQLite file; safe for use from many threads. Implements :class:`.store.Rows`."""
+
+    def __init__(self, path: Path) -> None:
+        """Open or create the database and bring it to the present schema.
+
+        Raises:
+            LedgerError: not a database of ours, of a newer schema, damaged, or not writable.
+        """
+        self._path = path
+        self._condition = threading.Condition()
+        self._pending: list[_Pending[Any]] = []
+        self._is_committing = False
+        self._failure: str | None = None
+        self._readers: queue.LifoQueue[sqlite3.Connection | None] = queue.LifoQueue()
+        for _ in range(_MAX_READERS):
+            self._readers.put(None)
+        with _errors_of(path):
+            self._writer = connect(path)
+            try:
+                self._writer.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
+                self._writer.execute("PRAGMA foreign_keys = ON")
+                _migrate(self._writer, path)
+            except BaseException:
+                self._writer.close()
+                raise
+        self._statements = _Statements(self._writer)
+
+    def write(self, change: Callable[[Transaction], T]) -> T:
+        """Carry out one change atomically; see :meth:`.store.Rows.write`."""
+        item: _Pending[T] = _Pending(change)
+        with self._condition:
+            self._pending.append(item)
+            while self._is_committing and not item.is_finished:
+                self._condition.wait()
+            batch: list[_Pending[Any]] = []
+            if not item.is_finished:
+                batch, self._pending = self._pending, []
+                self._is_committing = True
+        if batch:
+            try:
+                self._commit(batch)
+            finally:
+                with self._condition:
+                    for member in batch:
+                        member.is_finished = True
+                    self._is_committing = False
+                    self._condition.notify_all()
+        if item.error is not None:
+            raise item.error
+        return item.result
+
+    def read(self, query: Callable[[Reader], T]) -> T:
+        """Ask for committed rows; see :meth:`.store.Rows.read`."""
+        connection = self._readers.get()
+        try:
+            if self._failure is not None:
+                raise LedgerError(self._failure)
+            with _errors_of(self._path):
+                if connection is None:
+                    connection = connect(self._path)
+                    connection.execute("PRAGMA query_only = ON")
+                # One snapshot for all statements of the query.
+                connection.execute("BEGIN")
+                try:
+                    return query(_Statements(connection))
+                finally:
+                    connection.execute("COMMIT")
+        finally:
+            self._readers.put(connection)
+
+    def size_bytes(self) -> int:
+        """Bytes of the database file and its write-ahead log."""
+        return database_bytes(self._path)
+
+    def close(self) -> None:
+        """Finish the present commit, fold the write-ahead log into the database and close it."""
+        with self._condition:
+            while self._is_committing:
+                self._condition.wait()
+            if self._failure is None:
+                self._failure = f"{self._path} is closed"
+        for _ in range(_MAX_READERS):
+            connection = self._readers.get()
+            if connection is not None:
+                connection.close()
+        for _ in range(_MAX_READERS):
+            self._readers.put(None)
+        self._writer.close()
+
+    def _commit(self, batch: Sequence[_Pending[Any]]) -> None:
+        try:
+            if self._failure is not None:
+                raise LedgerError(self._failure)
+            with _errors_of(self._path):
+                self._writer.execute("BEGIN IMMEDIATE")
+                for item in batch:
+                    self._run_one(item)
+                self._writer.execute("COMMIT")
+        except BaseException as error:
+            if self._failure is None and _is_storage_failure(error.__cause__):
+                # After a failed write the state of the file is not known until it is opened and recovered again.
+                self._failure = f"{error}; the ledger has to be opened again"
+            with contextlib.suppress(sqlite3.Error):
+                if self._writer.in_transaction:
+                    self._writer.execute("ROLLBACK")
+            for item in batch:
+                item.error = item.error or error
+
+    def _run_one(self, item: _Pending[Any]) -> None:
+        self._writer.execute("SAVEPOINT change")
+        try:
+            item.run(self._statements)
+        except (sqlite3.IntegrityError, sqlite3.InterfaceError, sqlite3.DataError, sqlite3.ProgrammingError) as error:
+            item.error = LedgerError(f"{self._path}: {error}")
+            self._writer.execute("ROLLBACK TO change")
+        except sqlite3.Error:
+            # Full or failing storage may have ended the whole transaction: nobody in it is acknowledged.
+            raise
+        except BaseException as error:
+            item.error = error
+            self._writer.execute("ROLLBACK TO change")
+        self._writer.execute("RELEASE change")
+
+
+def connect(path: Path, *, is_read_only: bool = False) -> sqlite3.Connection:
+    """A connection with explicit transactions; whoever uses it from several threads keeps them apart."""
+    uri = f"{path.resolve().as_uri()}?mode={'ro' if is_read_only else 'rwc'}"
+    connection = sqlite3.connect(uri, uri=True, timeout=10.0, isolation_level=None, check_same_thread=False)
+    try:
+        if not is_read_only:
+            (mode,) = connection.execute("PRAGMA journal_mode = WAL").fetchone()
+            if mode != "wal":
+                raise LedgerError(f"{path}: this file system does not allow a write-ahead log")
+            connection.execute("PRAGMA synchronous = FULL")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+@contextlib.contextmanager
+def read_only(path: Path) -> Iterator[Reader]:
+    """Committed rows of a database that another process may be serving.
+
+    Raises:
+        LedgerError: no database of ours, or damaged.
+    """
+    with _errors_of(path):
+        if not path.is_file():
+            raise LedgerError(f"{path.parent} holds no ledger")
+        with contextlib.closing(connect(path, is_read_only=True)) as connection:
+            _check_version(_version(connection), path)
+            connection.execute("BEGIN")
+            yield _Statements(connection)
+
+
+def integrity_problems(path: Path) -> list[str]:
+    """What SQLite itself finds wrong with the file, its indexes and references; empty if sound."""
+    try:
+        with contextlib.closing(connect(path)) as connection:
+            found = [str(row[0]) for row in connection.execute("PRAGMA integrity_check(100)")]
+            for table, row, parent, _ in connection.execute("PRAGMA foreign_key_check"):
+                found.append(f"{table} row {row}: no such row in {parent}")
+    except sqlite3.Error as error:
+        return [str(error)]
+    return [line for line in found if line != "ok"]
+
+
+def rebuild_indexes(path: Path) -> None:
+    """Derive every index anew from its table.
+
+    Raises:
+        LedgerError: the tables themselves are damaged.
+    """
+    with _errors_of(path), contextlib.closing(connect(path)) as connection:
+        connection.execute("REINDEX")
+
+
+def copy_database(path: Path, target: Path) -> None:
+    """Write a consistent copy of the database, which another process may be serving, to a new file.
+
+    Raises:
+        LedgerError: it cannot be read or written.
+    """
+    with (
+        _errors_of(path),
+        contextlib.closing(connect(path, is_read_only=True)) as source,
+        contextlib.closing(sqlite3.connect(target)) as copy,
+    ):
+        source.backup(copy)
+        # One plain file, without a write-ahead log beside it.
+        copy.execute("PRAGMA journal_mode = DELETE")
+
+
+def database_bytes(path: Path) -> int:
+    """Bytes of a database file and its write-ahead log."""
+    total = 0
+    for file in (path, path.with_name(path.name + "-wal")):
+        with contextlib.suppress(FileNotFoundError):
+            total += file.stat().st_size
+    return total
+
+
+def _version(connection: sqlite3.Connection) -> int:
+    tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if not tables:
+        return 0
+    if "meta" in tables:
+        row = connection.execute("SELECT value FROM meta WHERE key = 'schema_version'").fetchone()
+        if row is not None and str(row[0]).isdecimal():
+            return int(row[0])
+    raise LedgerError("a database, but not one of a ledger")
+
+
+def _check_version(version: int, path: Path) -> None:
+    if version > SCHEMA_VERSION:
+        raise LedgerError(
+            f"{path} was written by a newer version: its schema is {version}, this one knows up to {SCHEMA_VERSION}"
+        )
+
+
+def _migrate(connection: sqlite3.Connection, path: Path) -> None:
+    connection.execute("BEGIN IMMEDIATE")
+    version = _version(connection)
+    _check_version(version, path)
+    # One transaction for all steps: an interrupted migration has not begun.
+    for step in MIGRATIONS[version:]:
+        for statement in step:
+            connection.execute(statement)
+    if version < SCHEMA_VERSION:
+        _Statements(connection).set_meta("schema_version", str(SCHEMA_VERSION))
+    connection.execute("COMMIT")
+
+
+def _is_storage_failure(error: BaseException | None) -> bool:
+    code = getattr(error, "sqlite_errorcode", 0) or 0
+    return code & 0xFF in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_READONLY)
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    """Turn SQLite's errors into ours."""
+    try:
+        yield
+    except VggtMotionError:
+        raise
+    except sqlite3.Error as error:
+        code = getattr(error, "sqlite_errorcode", None)
+        if code is not None and code & 0xFF == sqlite3.SQLITE_FULL:
+            raise DiskFullError(f"no space for the rows of {path}") from error
+        raise LedgerError(f"{path}: {error}") from error

@@ -1,0 +1,244 @@
+"""What the ledger needs of a store: rows in atomic transactions, and blobs addressed by their content.
+
+The two interfaces are small on purpose, so that PostgreSQL and an object store can stand behind them for servers with
+many vehicles, while SQLite (:mod:`.sqlite`) and files (:mod:`.blobs`) stay the embedded default. Every method of
+:class:`Transaction` is a plain SQL statement or two; :meth:`Transaction.next_open_job` is
+``SELECT ... ORDER BY priority, submission LIMIT 1 FOR UPDATE SKIP LOCKED``.
+
+Policy (what is idempotent, when a job is dead) lives in :mod:`.log` and :mod:`.jobs` and knows neither implementation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from vggt_motion.errors import RefusalCode, RequestRefusedError
+from vggt_motion.records import JobState
+
+T = TypeVar("T")
+
+
+class InvalidRequestError(RequestRefusedError):
+    """The request is malformed or out of bounds."""
+
+
+class ConflictError(RequestRefusedError):
+    """The id is known with another content."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, RefusalCode.CONFLICT)
+
+
+class UnknownError(RequestRefusedError):
+    """What was asked for or referred to does not exist: stream, blob, job, lease."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, RefusalCode.UNKNOWN)
+
+
+class DamagedBlobError(UnknownError):
+    """The bytes no longer have the hash they are stored under; they were set aside and may be appended again."""
+
+
+@dataclass(frozen=True)
+class BlobEntry:
+    """One blob as the rows know it."""
+
+    sha256: str  # 64 lower-case hexadecimal digits
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class NewRecord:
+    """A record as a client hands it in; the payload is opaque."""
+
+    stream: str
+    record_id: str
+    payload_type: str
+    payload: bytes
+    identity_sha256: bytes  # 32 bytes; two payloads are the same record if and only if these are equal
+
+
+@dataclass(frozen=True)
+class RecordRow:
+    """A record as it is stored."""
+
+    stream: str
+    sequence: int  # dense from 0
+    record_id: str
+    payload_type: str
+    payload: bytes
+    identity_sha256: bytes
+    append_time_ns: int  # wall clock, informative
+    row_sha256: bytes  # over all the fields above: what `ledger check` verifies
+
+
+@dataclass(frozen=True)
+class JobRow:
+    """A job as it is stored. Times are seconds of the queue's own clock, valid until the ledger is opened anew."""
+
+    job_id: str
+    submission: int  # order of submission, dense from 0
+    kind: str
+    model: str
+    priority: int
+    payload_type: str
+    payload: bytes
+    state: JobState = JobState.OPEN
+    attempt: int = 0  # leases handed out so far
+    failure_count: int = 0
+    lost_lease_count: int = 0
+    lease_id: str = ""  # of the present lease; empty unless leased
+    worker: str = ""  # of the present or last lease
+    deadline_s: float = 0.0  # of the present lease
+    not_before_s: float = 0.0  # back-off after a failure
+    last_reason: str = ""
+    last_traceback: str = ""
+
+
+@dataclass(frozen=True)
+class LeaseRow:
+    """A lease that was ever handed out; kept so that a late result can be recognised."""
+
+    lease_id: str
+    job_id: str
+    worker: str
+    claim_id: str
+    attempt: int
+
+
+class Reader(Protocol):
+    """Committed rows."""
+
+    def find_record(self, stream: str, record_id: str) -> RecordRow | None:
+        """The record with this id."""
+
+    def records(self, stream: str, from_sequence: int, limit: int) -> Sequence[RecordRow]:
+        """Up to ``limit`` records in order of sequence."""
+
+    def positions(self) -> Mapping[str, int]:
+        """Next sequence number of every stream that has records."""
+
+    def find_blob(self, sha256: str) -> BlobEntry | None:
+        """The blob, if a record refers to it."""
+
+    def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
+        """The blobs that a record refers to."""
+
+    def blob_bytes(self) -> int:
+        """Sum of the sizes of all blobs, each counted once."""
+
+    def find_meta(self, key: str) -> str | None:
+        """A fact about the session."""
+
+    def find_job(self, job_id: str) -> JobRow | None:
+        """The job with this id."""
+
+    def next_open_job(self, kinds: Collection[str], models: Collection[str], now_s: float) -> JobRow | None:
+        """The first open job by (priority, submission) that fits an offer and whose back-off is over.
+
+        It fits if its kind is offered and its model is offered or empty. Inside a transaction it is locked against
+        other claims.
+        """
+
+    def next_wake_s(self, kinds: Collection[str], models: Collection[str], now_s: float) -> float | None:
+        """When the earliest back-off after ``now_s`` of a matching open job ends."""
+
+    def leased_jobs(self, worker: str | None = None, deadline_before_s: float | None = None) -> Sequence[JobRow]:
+        """Leased jobs in order of submission, of one worker or with a deadline that is over."""
+
+    def find_lease(self, lease_id: str) -> LeaseRow | None:
+        """A lease that was ever handed out."""
+
+    def find_claim(self, worker: str, claim_id: str) -> LeaseRow | None:
+        """The lease that was handed out for a claim, if its job still has it."""
+
+    def job_counts(self) -> Mapping[tuple[str, str], int]:
+        """Number of jobs per (kind, state)."""
+
+    def jobs(self, state: str | None, after_job_id: str, limit: int) -> Sequence[JobRow]:
+        """Jobs in order of id."""
+
+
+class Transaction(Reader, Protocol):
+    """One atomic change; reads see its own writes."""
+
+    def next_sequence(self, stream: str) -> int:
+        """The next sequence number of a stream, taken: it is used up if and only if the change commits."""
+
+    def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
+        """Insert a record and its references to blobs."""
+
+    def set_meta(self, key: str, value: str) -> None:
+        """Insert or replace a fact about the session."""
+
+    def add_job(self, row: JobRow) -> None:
+        """Insert a job; its ``submission`` is replaced by the next one."""
+
+    def update_job(self, row: JobRow) -> None:
+        """Replace everything of a job but its content."""
+
+    def shift_deadlines(self, seconds: float) -> None:
+        """Move the deadline of every leased job."""
+
+    def reset_times(self) -> None:
+        """End every back-off: the clock that it was measured with is gone."""
+
+    def add_lease(self, row: LeaseRow) -> None:
+        """Insert a lease."""
+
+
+class Rows(Protocol):
+    """Durable rows."""
+
+    def write(self, change: Callable[[Transaction], T]) -> T:
+        """Carry out one change atomically; durable on return. An exception of ``change`` undoes it and is passed on.
+
+        Changes of several threads may be committed together, and a change may be run again when it could not be
+        serialised: it must not have effects of its own.
+
+        Raises:
+            DiskFullError: there is no space; nothing was changed.
+            LedgerError: the store failed; it has to be opened anew.
+        """
+
+    def read(self, query: Callable[[Reader], T]) -> T:
+        """Ask for committed rows."""
+
+    def size_bytes(self) -> int:
+        """Bytes that the rows take on disk."""
+
+    def close(self) -> None:
+        """Release everything; later calls raise LedgerError."""
+
+
+class Blobs(Protocol):
+    """Durable bytes, addressed by their SHA-256."""
+
+    def put(self, blobs: Sequence[bytes], *, keep_free_bytes: int) -> list[BlobEntry]:
+        """Make blobs durable, in order; durable on return. Known ones are not stored twice.
+
+        Raises:
+            DiskFullError: less than ``keep_free_bytes`` would be left, or there is no space.
+        """
+
+    def get(self, sha256: str) -> bytes:
+        """The bytes, verified.
+
+        Raises:
+            UnknownError: there is no such blob.
+            DamagedBlobError: its bytes are not what they were.
+        """
+
+    def has(self, sha256: str, size_bytes: int) -> bool:
+        """Whether the blob is there with this size; its content is verified on :meth:`get`."""
+
+    def free_bytes(self) -> int:
+        """Space left for more."""
+
+
+def reserve_line(free_bytes: int, keep_free_bytes: int) -> str:
+    """Why something is refused, for a person."""
+    return f"the ledger's disk has {free_bytes / 2**20:.0f} MiB left and keeps {keep_free_bytes / 2**20:.0f} MiB free"

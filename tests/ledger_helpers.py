@@ -1,0 +1,58 @@
+"""What the ledger's tests share: a session with an injected clock and records of opaque bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from pathlib import Path
+from typing import Any
+
+from vggt_motion.ledger.directory import Ledger
+from vggt_motion.ledger.jobs import JobPolicy
+from vggt_motion.ledger.store import NewRecord
+from vggt_motion.records import Job, JobKind, JobReport
+
+RESULT_STREAMS = {"describe": "descriptor", "predict": "submap", "register": "constraint"}
+
+
+class Clock:
+    """Seconds that only move when told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def record(stream: str, record_id: str, content: bytes = b"content", identity: bytes | None = None) -> NewRecord:
+    """A record whose identity is its content, unless said otherwise."""
+    digest = hashlib.sha256(content if identity is None else identity).digest()
+    return NewRecord(stream, record_id, "test.Record", content, digest)
+
+
+def dead_event(report: JobReport) -> NewRecord:
+    """The event of a dead job in a form that is easy to read back."""
+    text = f"{report.job_id}|{report.last_reason}|{report.last_traceback}".encode()
+    return record("event", f"job_dead/{report.job_id}", text)
+
+
+def predict(job_id: str, **options: Any) -> Job:
+    """A job of kind predict."""
+    return Job(job_id, JobKind.PREDICT, options.pop("payload", b"spec"), "test.Spec", **options)
+
+
+def open_ledger(directory: Path, clock: Clock | None = None, **options: Any) -> Ledger:
+    """A session whose leases are numbered."""
+    counter = itertools.count()
+    options.setdefault("new_lease_id", lambda: f"lease{next(counter)}")
+    options.setdefault("policy", JobPolicy())
+    return Ledger(
+        directory,
+        input_streams={"keyframe"},
+        result_streams=RESULT_STREAMS,
+        dead_event=dead_event,
+        clock=clock or Clock(),
+        time_ns=lambda: 42,
+        **options,
+    )
