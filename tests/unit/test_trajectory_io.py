@@ -74,6 +74,7 @@ def test_csv_and_json_round_trip(tmp_path: Path) -> None:
     assert_same(back.frames, source.frames, 0.0)
 
 
+@pytest.mark.data
 def test_real_ground_truth(data_dir: Path) -> None:
     folder = data_dir / "kitti_06_first51"
     back = trajectory_io.read_kitti(folder / "poses.txt", folder / "times.txt")

@@ -58,7 +58,7 @@ def moments(
     )
 
 
-def solve(of: Moments, scale: ScaleRule = "least_squares") -> Sim3:
+def solve(of: Moments, scale: ScaleRule = "least_squares", *, allow_line: bool = False) -> Sim3:
     """``target_from_source`` that minimises ``sum w |y - s R x - t|^2``.
 
     Args:
@@ -66,6 +66,7 @@ def solve(of: Moments, scale: ScaleRule = "least_squares") -> Sim3:
         scale: ``least_squares`` is Umeyama's, which noise in the source pulls below the truth; ``symmetric`` is the
             ratio of the standard deviations, which treats both sides alike (the estimate of the inverse is the inverse
             of the estimate); ``fixed`` keeps 1, a rigid transform.
+        allow_line: accept points on a line, and return any one of the rotations that fit them equally well.
 
     Raises:
         RegistrationError: all points coincide or lie on a line, so that a rotation is not determined.
@@ -73,7 +74,7 @@ def solve(of: Moments, scale: ScaleRule = "least_squares") -> Sim3:
     if not (np.isfinite(of.cross).all() and of.variance_source > 0.0 and of.variance_target > 0.0):
         raise RegistrationError("points coincide or are not finite")
     u, singular, vt = np.linalg.svd(of.cross)
-    if singular[1] <= _COLLINEAR_RATIO * singular[0] or singular[0] <= 0.0:
+    if singular[0] <= 0.0 or (singular[1] <= _COLLINEAR_RATIO * singular[0] and not allow_line):
         raise RegistrationError("points lie on a line: the rotation about it is not determined")
     signs = np.array([1.0, 1.0, 1.0 if np.linalg.det(u) * np.linalg.det(vt) > 0.0 else -1.0])
     rotation = (u * signs) @ vt
