@@ -1,0 +1,147 @@
+"""Client of the durable log (DESIGN section 4)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vggt_motion.bus import calls, codec
+from vggt_motion.bus.retry import retry
+from vggt_motion.bus.session import Bus
+from vggt_motion.errors import CodecError, LedgerError
+from vggt_motion.records import BlobRef, LedgerStatus, LogEntry
+
+_BLOB_PATIENCE_S = 15.0
+
+
+@dataclass(frozen=True)
+class AppendResult:
+    """Acknowledgement: the record is on disk."""
+
+    sequence: int
+    was_known: bool  # it had been appended before
+
+
+def append_request(stream: str, record_id: str, record: codec.Record, blobs: Sequence[bytes]) -> calls.AppendRequest:
+    """The request that makes a record durable, with its identity and everything that it refers to.
+
+    Raises:
+        CodecError: the record breaks a rule of the wire, or a blob is not one that it refers to.
+    """
+    refs = codec.blob_refs(record)
+    known = {ref.sha256 for ref in refs}
+    for blob in blobs:
+        if hashlib.sha256(blob).hexdigest() not in known:
+            raise CodecError(f"{record_id}: a blob of {len(blob)} bytes is not referred to by the record")
+    return calls.AppendRequest(
+        stream=str(stream),
+        record_id=record_id,
+        payload_type=codec.payload_type(type(record)),
+        payload=codec.encode(record),
+        identity_sha256=codec.identity_digest(record),
+        blobs=tuple(blobs),
+        blob_refs=refs,
+    )
+
+
+class LedgerClient:
+    """Calls of the ledger. Thread-safe."""
+
+    def __init__(self, bus: Bus) -> None:
+        """Bind the bus."""
+        self._bus = bus
+
+    def append(
+        self,
+        stream: str,
+        record_id: str,
+        record: codec.Record,
+        blobs: Sequence[bytes] = (),
+        *,
+        patience_s: float | None = None,
+    ) -> AppendResult:
+        """Make a record durable, with the blobs that it refers to and that the ledger may not have yet.
+
+        Returns only when it is on disk. While the ledger or the link is down, tries again: for ``patience_s``, or for
+        ever.
+
+        Raises:
+            BusUnavailableError: patience is at its end, or the process was told to stop; whether it was stored is not
+                known, and appending again is safe.
+            RequestRefusedError: refused; code CONFLICT if the id is known with another content.
+            DiskFullError: the ledger takes nothing until there is space again.
+            CodecError: the record breaks a rule of the wire.
+        """
+        payload = codec.encode(append_request(stream, record_id, record, blobs))
+        key = self._bus.keys.rpc("ledger", "append")
+        reply = retry(
+            self._bus,
+            lambda: codec.decode(calls.AppendReply, self._bus.request(key, payload)),
+            patience_s=patience_s,
+            what=f"append {record_id}",
+        )
+        return AppendResult(reply.sequence, reply.was_known)
+
+    def read(self, stream: str, from_sequence: int, limit: int = 0, *, patience_s: float = 0.0) -> list[LogEntry]:
+        """Entries of a stream from a sequence number on, in order and without gap.
+
+        Args:
+            stream: its name.
+            from_sequence: first to return; 0 is the beginning.
+            limit: at most so many; 0 = as many as the ledger likes. May be fewer, but is empty only at the end.
+            patience_s: how long to try again while nobody answers.
+
+        Raises:
+            BusUnavailableError: nobody answers.
+            RequestRefusedError: the stream is unknown.
+        """
+        return list(self.page(stream, from_sequence, limit, patience_s=patience_s).entries)
+
+    def page(self, stream: str, from_sequence: int, limit: int = 0, *, patience_s: float = 0.0) -> calls.ReadReply:
+        """As :meth:`read`, with the position of the stream's end.
+
+        Raises:
+            CodecError: the answer has a gap, or is not what was asked for.
+        """
+        payload = codec.encode(calls.ReadRequest(str(stream), from_sequence, limit))
+        key = self._bus.keys.rpc("ledger", "read")
+        reply = retry(
+            self._bus,
+            lambda: codec.decode(calls.ReadReply, self._bus.request(key, payload)),
+            patience_s=patience_s,
+            what=f"read {stream}",
+        )
+        for offset, entry in enumerate(reply.entries):
+            if entry.sequence != from_sequence + offset or entry.stream != stream:
+                raise CodecError(
+                    f"read {stream}: entry {entry.stream}/{entry.sequence} in place of {from_sequence + offset}"
+                )
+        return reply
+
+    def blob(self, ref: BlobRef, *, patience_s: float = _BLOB_PATIENCE_S) -> bytes:
+        """The bytes of a blob, verified.
+
+        Raises:
+            BusUnavailableError: nobody answers.
+            RequestRefusedError: the ledger does not have it (code UNKNOWN).
+            LedgerError: what came is not what the reference says.
+        """
+        content = retry(
+            self._bus,
+            lambda: self._bus.request(self._bus.keys.blob(ref.sha256), b""),
+            patience_s=patience_s,
+            what=f"blob {ref.sha256[:12]}",
+        )
+        if len(content) != ref.size_bytes or hashlib.sha256(content).hexdigest() != ref.sha256:
+            raise LedgerError(f"blob {ref.sha256[:12]}: {len(content)} bytes came that are not its content")
+        return content
+
+    def status(self) -> LedgerStatus:
+        """Positions, jobs and space.
+
+        Raises:
+            BusUnavailableError: nobody answers.
+        """
+        key = self._bus.keys.rpc("ledger", "status")
+        return codec.decode(LedgerStatus, self._bus.request(key, codec.encode(calls.StatusRequest())))

@@ -1,0 +1,227 @@
+"""Publishing and subscribing: one thread drains each subscription, so that no channel ever fills up by neglect."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import zenoh
+from zenoh import ext, handlers
+
+from vggt_motion.errors import BusError, BusUnavailableError
+
+_log = logging.getLogger(__name__)
+_FIFO_CAPACITY = 8  # the default of 256 messages would be a gigabyte of images
+_LATEST_CAPACITY = 1
+_HEARTBEAT_S = 0.5
+_JOIN_S = 1.0
+_NS_PER_S = 1_000_000_000
+MAX_PAYLOAD_BYTES = 768 * 2**20  # Zenoh drops what exceeds 1 GiB without a word
+
+
+class Closable(Protocol):
+    """Something that is at work until it is closed; closing twice does nothing."""
+
+    is_closed: bool
+
+    def close(self) -> None:
+        """End it."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One received message."""
+
+    key: str
+    payload: bytes = field(repr=False)
+    timestamp_ns: int | None  # given by the publisher, else by the router; to about a nanosecond
+    attachment: bytes
+    encoding: str
+
+
+class Publisher:
+    """Publishes on one key. Thread-safe."""
+
+    def __init__(self, session: zenoh.Session, key: str, *, blocking: bool, history: int, encoding: str) -> None:
+        congestion = zenoh.CongestionControl.BLOCK if blocking else zenoh.CongestionControl.DROP
+        self.is_closed = False
+        self._key = key
+        self._timestamp_id = _timestamp_id(session)
+        self._publisher: Any
+        if history > 0:
+            self._publisher = ext.declare_advanced_publisher(
+                session,
+                key,
+                encoding=encoding or None,
+                congestion_control=congestion,
+                reliability=zenoh.Reliability.RELIABLE,
+                cache=ext.CacheConfig(history),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+                publisher_detection=True,
+            )
+        else:
+            self._publisher = session.declare_publisher(
+                key,
+                encoding=encoding or None,
+                congestion_control=congestion,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
+
+    def put(self, payload: bytes, *, timestamp_ns: int | None = None, attachment: bytes = b"") -> None:
+        """Publish.
+
+        Args:
+            payload: the message.
+            timestamp_ns: Unix time to travel with it; None lets the router put its own.
+            attachment: small bytes beside the payload.
+
+        Raises:
+            BusUnavailableError: the session is closed.
+            BusError: the message is longer than the bus carries.
+        """
+        if len(payload) > MAX_PAYLOAD_BYTES:
+            raise BusError(f"{self._key}: a message of {len(payload)} bytes is longer than the bus carries")
+        timestamp = None
+        if timestamp_ns is not None:
+            seconds, nanoseconds = divmod(timestamp_ns, _NS_PER_S)
+            timestamp = zenoh.Timestamp(zenoh.NTP64(seconds, nanoseconds), self._timestamp_id)
+        try:
+            self._publisher.put(payload, attachment=attachment or None, timestamp=timestamp)
+        except zenoh.ZError as error:
+            raise BusUnavailableError(f"{self._key}: cannot publish: {_one_line(error)}") from None
+
+    def close(self) -> None:
+        """Undeclare; a cache of history goes with it."""
+        self.is_closed = True
+        _undeclare(self._publisher)
+
+
+class Subscription:
+    """Delivers samples of a key to a callback, in a thread of ours."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        callback: Callable[[Sample], None],
+        *,
+        latest_only: bool,
+        history: bool,
+    ) -> None:
+        channel: Any = handlers.RingChannel(_LATEST_CAPACITY) if latest_only else handlers.FifoChannel(_FIFO_CAPACITY)
+        self._callback = callback
+        self._key = key
+        self.is_closed = False
+        self._subscriber: Any
+        if history:
+            self._subscriber = ext.declare_advanced_subscriber(
+                session,
+                key,
+                channel,
+                history=ext.HistoryConfig(detect_late_publishers=True),
+                recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            )
+        else:
+            self._subscriber = session.declare_subscriber(key, channel)
+        # The handler on its own: undeclaring a subscriber while a thread waits in it is refused as borrowed.
+        self._handler = self._subscriber.handler
+        self._thread = threading.Thread(target=self._drain, name=f"drain {key}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Undeclare and wait for the callback that may be under way, if not called from it."""
+        self.is_closed = True
+        _undeclare(self._subscriber)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_JOIN_S)
+
+    def _drain(self) -> None:
+        while True:
+            try:
+                received = self._handler.recv()
+            except zenoh.ZError:
+                return  # undeclared, or the session was closed
+            if self.is_closed:
+                return
+            if received.kind != zenoh.SampleKind.PUT:
+                continue
+            try:
+                self._callback(_to_sample(received))
+            except Exception:
+                _log.exception("a subscriber's callback failed; the message is passed over", extra={"key": self._key})
+
+
+class LivelinessSubscription:
+    """Tells a callback which liveliness tokens of a key appear and disappear, those that are there already included."""
+
+    def __init__(self, session: zenoh.Session, key: str, callback: Callable[[str, bool], None]) -> None:
+        self.is_closed = False
+        self._callback = callback
+        channel: Any = handlers.FifoChannel(_FIFO_CAPACITY)
+        self._subscriber: Any = session.liveliness().declare_subscriber(key, channel, history=True)
+        self._handler = self._subscriber.handler
+        self._thread = threading.Thread(target=self._drain, name=f"drain {key}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Undeclare."""
+        self.is_closed = True
+        _undeclare(self._subscriber)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_JOIN_S)
+
+    def _drain(self) -> None:
+        while True:
+            try:
+                received = self._handler.recv()
+            except zenoh.ZError:
+                return
+            try:
+                self._callback(str(received.key_expr), received.kind == zenoh.SampleKind.PUT)
+            except Exception:
+                _log.exception("a liveliness callback failed", extra={"key": str(received.key_expr)})
+
+
+class Token:
+    """A liveliness token: there as long as this process and its link are."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self.is_closed = False
+        self._token: Any = session.liveliness().declare_token(key)
+
+    def close(self) -> None:
+        """Take it back."""
+        self.is_closed = True
+        _undeclare(self._token)
+
+
+def _to_sample(received: zenoh.Sample) -> Sample:
+    timestamp_ns = None
+    if received.timestamp is not None:
+        time = received.timestamp.get_time_as_ntp64()
+        timestamp_ns = time.as_secs() * _NS_PER_S + time.subsec_nanos()
+    return Sample(
+        key=str(received.key_expr),
+        payload=received.payload.to_bytes(),
+        timestamp_ns=timestamp_ns,
+        attachment=received.attachment.to_bytes() if received.attachment is not None else b"",
+        encoding=str(received.encoding),
+    )
+
+
+def _timestamp_id(session: zenoh.Session) -> zenoh.TimestampId:
+    return session.new_timestamp().get_id()
+
+
+def _undeclare(entity: Any) -> None:
+    try:
+        entity.undeclare()
+    except (zenoh.ZError, RuntimeError):
+        return  # undeclared before, or its session is closed
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

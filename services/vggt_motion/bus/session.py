@@ -1,0 +1,294 @@
+"""Joining the bus: our Zenoh configuration, and the session behind a small interface.
+
+The settings follow measurements: shared memory can lose data and leaks segments of killed processes, multicast and
+gossip find strangers, and a link lease of 10 s is too long to notice a frozen peer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
+
+import zenoh
+from zenoh import handlers
+
+from vggt_motion.bus import calls, codec
+from vggt_motion.bus.keys import Keys
+from vggt_motion.bus.pubsub import (
+    MAX_PAYLOAD_BYTES,
+    Closable,
+    LivelinessSubscription,
+    Publisher,
+    Sample,
+    Subscription,
+    Token,
+)
+from vggt_motion.bus.serving import REFUSAL_ENCODING, Handler, Server, error_of
+from vggt_motion.config import BusConfig
+from vggt_motion.errors import BusError, BusUnavailableError, CodecError, ConfigurationError
+
+__all__ = ["Bus", "Closable", "EndpointTakenError", "Sample", "open_bus", "zenoh_config"]
+
+_log = logging.getLogger(__name__)
+_ATTEMPT_S = 1.0
+_RETRY_S = 0.2
+_CLOSE_S = 1.0
+Kept = TypeVar("Kept", bound=Closable)
+
+
+class EndpointTakenError(ConfigurationError):
+    """The router's endpoint cannot be listened on."""
+
+
+def zenoh_config(config: BusConfig, mode: Literal["client", "router"] = "client") -> zenoh.Config:
+    """Our Zenoh configuration, on top of the user's file if there is one.
+
+    Raises:
+        ConfigurationError: Zenoh does not accept the file or the endpoint.
+    """
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": config.shared_memory,
+        "transport/link/tx/lease": round(config.lease_s * 1000),
+    }
+    if mode == "router":
+        settings["listen/endpoints"] = [config.endpoint]
+        settings["listen/timeout_ms"] = 0
+        settings["listen/exit_on_failure"] = True
+    else:
+        settings["connect/endpoints"] = [config.endpoint]
+        settings["connect/timeout_ms"] = round(_ATTEMPT_S * 1000)
+        # As one object: inserted one by one, each value alone contradicts the defaults of the others.
+        settings["connect/retry"] = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
+    try:
+        merged = zenoh.Config() if config.zenoh_config is None else zenoh.Config.from_file(config.zenoh_config)
+        for key, value in settings.items():
+            merged.insert_json5(key, json.dumps(value))
+    except (zenoh.ZError, OSError) as error:
+        place = f"bus.endpoint {config.endpoint}" if config.zenoh_config is None else f"{config.zenoh_config}"
+        raise ConfigurationError(f"{place}: not accepted by Zenoh: {_reason(error)}") from None
+    return merged
+
+
+def open_bus(
+    config: BusConfig,
+    mode: Literal["client", "router"] = "client",
+    *,
+    stopping: threading.Event | None = None,
+) -> Bus:
+    """Join the bus.
+
+    Args:
+        config: endpoint, session and timeouts.
+        mode: "client" connects to the router and tries for ``connect_timeout_s``; "router" is the router.
+        stopping: ends the attempts early.
+
+    Raises:
+        BusUnavailableError: no router answers at the endpoint.
+        EndpointTakenError: as a router: the endpoint cannot be listened on.
+        ConfigurationError: the configuration is not accepted.
+    """
+    settings = zenoh_config(config, mode)
+    if mode == "router":
+        try:
+            return Bus(zenoh.open(settings), config)
+        except zenoh.ZError as error:
+            problem = "is already in use" if "in use" in str(error) else f"cannot be used: {_reason(error)}"
+            raise EndpointTakenError(f"endpoint {config.endpoint} {problem}") from None
+    deadline = time.monotonic() + config.connect_timeout_s
+    while True:
+        try:
+            return Bus(zenoh.open(settings), config)
+        except zenoh.ZError as error:
+            if "Unable to connect" not in str(error) and "imeout" not in str(error):
+                raise ConfigurationError(f"bus.endpoint {config.endpoint}: {_reason(error)}") from None
+        if stopping is not None and stopping.is_set():
+            raise BusUnavailableError(f"stopped while waiting for a router at {config.endpoint}")
+        if time.monotonic() >= deadline:
+            raise BusUnavailableError(f"no router at {config.endpoint} within {config.connect_timeout_s:g} s")
+        (stopping or threading.Event()).wait(_RETRY_S)
+
+
+class Bus:
+    """One session on the bus. Thread-safe; everything that was declared through it ends with it."""
+
+    def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
+        """Wrap an open session; use :func:`open_bus`."""
+        self.config = config
+        self.keys = Keys(config.session)
+        self._session = session
+        self._lock = threading.Lock()
+        self._requests: set[zenoh.CancellationToken] = set()
+        self._closables: list[Closable] = []
+        self._interrupted = threading.Event()
+        self.is_closed = False
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a link to a router at this moment."""
+        return not self.is_closed and bool(self._session.info.routers_zid())
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether requests have been ended by :meth:`interrupt` or :meth:`close`."""
+        return self._interrupted.is_set()
+
+    def request(self, key: str, payload: bytes, *, timeout_s: float | None = None) -> bytes:
+        """An acknowledged call: send a query and wait for its one answer.
+
+        Raises:
+            BusUnavailableError: nobody answered, the link is down, or requests were interrupted; may be repeated.
+            RequestRefusedError: the other side refused; ``code`` says why.
+            DiskFullError: the other side has no space.
+            BusError: the message is longer than the bus carries.
+        """
+        if len(payload) > MAX_PAYLOAD_BYTES:
+            raise BusError(f"{key}: a request of {len(payload)} bytes is longer than the bus carries")
+        timeout = self.config.request_timeout_s if timeout_s is None else timeout_s
+        token = zenoh.CancellationToken()
+        with self._lock:
+            if self._interrupted.is_set():
+                raise BusUnavailableError(f"{key}: stopping")
+            self._requests.add(token)
+        try:
+            replies: Any = self._session.get(
+                key,
+                handlers.FifoChannel(2),
+                payload=payload,
+                timeout=timeout,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                cancellation_token=token,
+            )
+            reply = replies.recv()
+        except zenoh.ZError:
+            # A channel that closes without a reply: nobody serves the key, or whoever did has gone.
+            if self._interrupted.is_set():
+                raise BusUnavailableError(f"{key}: stopping") from None
+            raise BusUnavailableError(f"{key}: nobody answers") from None
+        finally:
+            with self._lock:
+                self._requests.discard(token)
+        if reply.ok is not None:
+            return bytes(reply.ok.payload.to_bytes())
+        error = reply.err
+        if str(error.encoding) != REFUSAL_ENCODING:  # Zenoh's own, such as a timeout
+            raise BusUnavailableError(f"{key}: no answer within {timeout:g} s ({error.payload.to_bytes()[:80]!r})")
+        try:
+            refusal = codec.decode(calls.Refusal, error.payload.to_bytes())
+        except CodecError as problem:
+            raise BusUnavailableError(f"{key}: an answer that cannot be read: {problem}") from None
+        raise error_of(refusal)
+
+    def serve(self, key: str, handler: Handler, *, threads: int = 1) -> Closable:
+        """Answer requests on a key.
+
+        ``handler(key of the request, payload)`` runs in up to ``threads`` threads of ours and may block; a
+        VggtMotionError that it raises becomes an error reply. Waiting requests are bounded; beyond that they are
+        refused as unavailable.
+        """
+        return self._keep(Server(self._session, key, handler, threads=threads))
+
+    def publisher(self, key: str, *, blocking: bool, history: int = 0, encoding: str = "") -> Publisher:
+        """A publisher on a key.
+
+        Args:
+            key: concrete key.
+            blocking: wait for slow subscribers instead of dropping: for file images and the log only.
+            history: so many messages are kept for late and recovering subscribers.
+            encoding: from ``codec.encoding_of``.
+        """
+        return self._keep(Publisher(self._session, key, blocking=blocking, history=history, encoding=encoding))
+
+    def subscribe(
+        self,
+        key: str,
+        callback: Callable[[Sample], None],
+        *,
+        latest_only: bool = False,
+        history: bool = False,
+        isolated: bool = False,
+    ) -> Closable:
+        """Deliver the samples of a key to ``callback``, in a thread of ours.
+
+        Args:
+            key: may hold wildcards.
+            callback: must not stay away long unless ``latest_only`` or ``isolated``: a subscription that is not drained
+                holds up everything on its link, the answers to this process's own requests included.
+            latest_only: old samples are dropped in favour of the newest: for live views.
+            history: first what the publishers keep, and recover what a broken link lost; needs ``history`` there too.
+            isolated: over a link of its own, where a slow callback slows down nothing but a blocking publisher.
+        """
+        if not isolated:
+            return self._keep(Subscription(self._session, key, callback, latest_only=latest_only, history=history))
+        own = open_bus(self.config)
+        own.subscribe(key, callback, latest_only=latest_only, history=history)
+        return self._keep(own)
+
+    def watch_liveliness(self, key: str, callback: Callable[[str, bool], None]) -> Closable:
+        """Tell ``callback(key, is alive)`` of every liveliness token, present ones first."""
+        return self._keep(LivelinessSubscription(self._session, key, callback))
+
+    def declare_token(self, key: str) -> Closable:
+        """Declare a liveliness token."""
+        return self._keep(Token(self._session, key))
+
+    def interrupt(self) -> None:
+        """End all requests under way and refuse new ones, so that a process that was told to stop does not wait."""
+        with self._lock:
+            self._interrupted.set()
+            pending = list(self._requests)
+        for token in pending:
+            with contextlib.suppress(zenoh.ZError):
+                token.cancel()  # type: ignore[no-untyped-call]
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleep between attempts; True as soon as requests are interrupted."""
+        return self._interrupted.wait(timeout_s)
+
+    def close(self) -> None:
+        """End everything declared here, flush, and leave; a link that does not flush is abandoned after a second."""
+        with self._lock:
+            if self.is_closed:
+                return
+            self.is_closed = True
+            closables = list(reversed(self._closables))
+            self._closables.clear()
+        self.interrupt()
+
+        def leave() -> None:
+            for closable in closables:
+                closable.close()
+            self._session.close()  # type: ignore[no-untyped-call]
+
+        thread = threading.Thread(target=leave, name="leave the bus", daemon=True)
+        thread.start()
+        thread.join(_CLOSE_S)
+        if thread.is_alive():
+            _log.warning("the link does not flush and is abandoned", extra={"endpoint": self.config.endpoint})
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _keep(self, closable: Kept) -> Kept:
+        with self._lock:
+            if self.is_closed:
+                raise BusUnavailableError("the bus is closed")
+            self._closables = [entry for entry in self._closables if not entry.is_closed]
+            self._closables.append(closable)
+        return closable
+
+
+def _reason(error: Exception) -> str:
+    # Zenoh appends the place in its source to every message.
+    return " ".join(str(error).split()).split(" at /")[0]

@@ -1,0 +1,185 @@
+"""Real processes for the tests of the bus: run as ``python bus_processes.py ROLE ENDPOINT ...``; and what starts them."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from vggt_motion.bus import calls, codec, router
+from vggt_motion.bus.keys import last_chunk
+from vggt_motion.bus.service import ServiceContext, run_service
+from vggt_motion.bus.session import Bus, open_bus
+from vggt_motion.config import BusConfig, Config
+from vggt_motion.errors import BusUnavailableError, DiskFullError, RefusalCode, RequestRefusedError
+from vggt_motion.records import Event, EventKind, LogEntry
+
+_log = logging.getLogger(__name__)
+SESSION = "test"
+READY_S = 20.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def bus_config(endpoint: str, **changes: float) -> BusConfig:
+    return BusConfig(endpoint=endpoint, session=SESSION, lease_s=3.0, **changes)
+
+
+def event(number: int) -> Event:
+    return Event(f"event-{number}", EventKind.WARNING, f"number {number}", number)
+
+
+def entry(number: int) -> LogEntry:
+    return LogEntry("event", number, f"event-{number}", codec.payload_type(Event), codec.encode(event(number)), number)
+
+
+# --- starting and stopping -------------------------------------------------------------------------------------------
+class Process:
+    """One child; its standard error goes to a file, so that it never blocks."""
+
+    def __init__(self, folder: Path, role: str, endpoint: str, *arguments: str) -> None:
+        self.log = folder / f"{role}-{time.monotonic_ns()}.log"
+        with self.log.open("wb") as file:
+            command = [sys.executable, __file__, role, endpoint, *arguments]
+            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file)
+
+    def wait(self, timeout_s: float = READY_S) -> int:
+        return self.process.wait(timeout_s)
+
+    def terminate(self) -> float:
+        """SIGTERM; seconds until it has ended."""
+        begin = time.monotonic()
+        self.process.terminate()
+        self.process.wait(30)
+        return time.monotonic() - begin
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(10)
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def text(self) -> str:
+        return self.log.read_text()
+
+
+@contextlib.contextmanager
+def running(folder: Path, role: str, endpoint: str, *arguments: str) -> Iterator[Process]:
+    process = Process(folder, role, endpoint, *arguments)
+    try:
+        yield process
+    finally:
+        if process.process.poll() is None:
+            process.signal(signal.SIGCONT)
+            process.kill()
+
+
+def connect(endpoint: str, **changes: float) -> Bus:
+    return open_bus(bus_config(endpoint, **{"connect_timeout_s": READY_S, **changes}))
+
+
+def wait_until(condition: object, timeout_s: float = READY_S) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < end, "did not come about in time"
+        time.sleep(0.02)
+
+
+# --- roles -----------------------------------------------------------------------------------------------------------
+def answer(context: ServiceContext) -> None:
+    """Answers on @rpc/test/*: what the bus promises to carry."""
+    release = threading.Event()
+
+    def handler(key: str, payload: bytes) -> bytes:
+        match last_chunk(key):
+            case "echo":
+                return payload
+            case "conflict":
+                raise RequestRefusedError("event-1 is known with another content", RefusalCode.CONFLICT)
+            case "full":
+                raise DiskFullError("12 MB are left,\nthe reserve is 256 MB")
+            case "defect":
+                raise ZeroDivisionError("secret detail")
+            case "slow":
+                release.wait(30)
+                return b"late"
+        raise RequestRefusedError("unknown call", RefusalCode.UNKNOWN)
+
+    for call in ("echo", "conflict", "full", "defect"):
+        context.bus.serve(context.bus.keys.rpc("test", call), handler)
+    context.bus.serve(context.bus.keys.rpc("test", "slow"), handler, threads=2)
+    context.set_health("working", "answering", requests=1.0)
+    context.stopping.wait()
+
+
+def small_ledger(context: ServiceContext, count: int, interval_s: float) -> None:
+    """A log in memory, of which the live publications of every fifth record are left out."""
+    records = [entry(number) for number in range(count)]
+    visible = 0
+
+    def read(_: str, payload: bytes) -> bytes:
+        request = codec.decode(calls.ReadRequest, payload)
+        page = records[request.from_sequence : min(visible, request.from_sequence + 7)]
+        return codec.encode(calls.ReadReply(tuple(page), visible))
+
+    context.bus.serve(context.bus.keys.rpc("ledger", "read"), read)
+    publisher = context.bus.publisher(context.bus.keys.log("event"), blocking=True, history=16)
+    context.set_health("working", "publishing")
+    for number, record in enumerate(records):
+        if context.stopping.wait(interval_s):
+            return
+        visible = number + 1
+        if number % 5 != 3:
+            publisher.put(codec.encode(record))
+    context.set_health("idle", "all published")
+    context.stopping.wait()
+
+
+def stubborn(context: ServiceContext) -> None:
+    """Waits in a request that nobody will answer, in the main thread."""
+    context.set_health("waiting", "for an answer")
+    with contextlib.suppress(BusUnavailableError):
+        context.bus.request(context.bus.keys.rpc("test", "slow"), b"", timeout_s=60.0)
+
+
+def busy(context: ServiceContext) -> None:
+    """Publishes and follows for all it is worth until it is told to stop."""
+    publisher = context.bus.publisher(context.bus.keys.image("front"), blocking=False, history=2)
+    context.bus.subscribe(context.bus.keys.all_images(), lambda _: None, latest_only=True)
+    context.set_health("working")
+    while not context.stopping.is_set():
+        publisher.put(bytes(200_000))
+
+
+def main(arguments: list[str]) -> int:
+    role, endpoint, *rest = arguments
+    config = Config(bus=bus_config(endpoint, connect_timeout_s=float(os.environ.get("TEST_CONNECT_TIMEOUT_S", "20"))))
+    match role:
+        case "router":
+            return router.main(config)
+        case "answer":
+            return run_service("answer", config, answer, instance=rest[0] if rest else None)
+        case "ledger":
+            return run_service("ledger", config, lambda context: small_ledger(context, int(rest[0]), float(rest[1])))
+        case "stubborn":
+            return run_service("stubborn", config, stubborn)
+        case "busy":
+            return run_service("busy", config, busy)
+    raise SystemExit(f"unknown role {role}")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
