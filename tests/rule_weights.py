@@ -15,6 +15,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from vggt_motion.inference.vggt.architecture import VggtArchitecture
+
+# A real VGGT network of 0.6 MB: everything is there, nothing is large.
+TINY = VggtArchitecture(
+    width=64,
+    depth=4,
+    heads=1,
+    backbone_depth=1,
+    dense_levels=(0, 1, 2, 3),
+    dense_features=8,
+    dense_channels=(8, 8, 16, 16),
+    embedding_grid=5,
+    camera_depth=1,
+)
 FIXTURES_VARIABLE = "VGGT_MOTION_FIXTURES"
 _REPOSITORY = Path(__file__).resolve().parents[1]
 _UPDATE_BIAS = (0.02, -0.01, 0.03, 0.01, 0.02, -0.02, 0.25, 0.25, 0.3)  # a plausible camera, not all at one place

@@ -104,6 +104,54 @@ class SfmConfig(Section):
     seed: int = Field(0, ge=0)
 
 
+class VggtConfig(Section):
+    """The predictor ``vggt``: any checkpoint of that architecture."""
+
+    model: str = Field(
+        "facebook/VGGT-1B", min_length=1, description="a .pt or .safetensors file, or a Hugging Face name OWNER/NAME"
+    )
+    allow_download: bool = Field(True, description="fetch a Hugging Face name that is not in the cache")
+    device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d{1,2})?)$")
+    dtype: Literal["auto", "float32", "bfloat16", "float16"] = Field(
+        "auto", description="of the transformer; heads run in float32"
+    )
+    cpu_threads: int | None = Field(None, ge=1, description="of torch; None = its own choice, all cores")
+    width_px: int = Field(518, ge=70, le=2072, multiple_of=14, description="width of the network's images")
+    frame_chunk: int | None = Field(
+        None, ge=1, description="frames that the heads take at a time; None = by free memory, at most"
+    )
+    max_batch_submaps: int = Field(8, ge=1, description="submaps of one shape that are predicted together at most")
+    memory_reserve_bytes: int = Field(512 * 2**20, ge=0, description="free memory that a prediction must leave")
+    dense_levels: tuple[int, int, int, int] | None = Field(
+        None, description="levels that the dense heads read, for checkpoints that are neither 4 nor 24 levels deep"
+    )
+
+
+class ForeignConfig(Section):
+    """A predictor that runs another project's package, in that package's own Python environment."""
+
+    model: str = Field(min_length=1, description="the package's name for its weights: a Hugging Face name or a folder")
+    python: Path | None = Field(
+        None, description="interpreter of the environment that has the package; None = the one that runs us"
+    )
+    device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d{1,2})?)$")
+
+
+class SkyConfig(Section):
+    """Sky that is kept out of depth and confidence."""
+
+    model: Path | None = Field(None, description="skyseg.onnx, brought by the user; None = sky is not looked for")
+    threshold: float = Field(
+        32 / 255, gt=0, lt=1, description="sky where the segmenter's value, stretched to [0, 1] per image, reaches this"
+    )
+    min_peak: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="a frame whose largest raw value stays below this has no sky: guard for the stretch",
+    )
+
+
 class InferenceConfig(Section):
     """The predictor and its worker."""
 
@@ -116,6 +164,12 @@ class InferenceConfig(Section):
         300.0, gt=0, description="a prediction that takes longer is ended and reported as failed"
     )
     sfm: SfmConfig = SfmConfig()
+    vggt: VggtConfig = VggtConfig()
+    pi3: ForeignConfig = ForeignConfig(model="yyfz233/Pi3")
+    pi3x: ForeignConfig = ForeignConfig(model="yyfz233/Pi3X")
+    depth_anything_3: ForeignConfig = ForeignConfig(model="depth-anything/DA3NESTED-GIANT-LARGE-1.1")
+    map_anything: ForeignConfig = ForeignConfig(model="facebook/map-anything-apache")
+    sky: SkyConfig = SkyConfig()
 
 
 class RegistrationConfig(Section):
