@@ -297,6 +297,11 @@ def test_concurrent_appends_share_one_commit(ledger: Ledger) -> None:
     }
 
 
+def test_a_commit_is_forced_to_the_disk(ledger: Ledger) -> None:
+    assert ledger.rows._writer.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    assert ledger.rows._writer.execute("PRAGMA synchronous").fetchone() == (2,), "FULL: an fsync with every commit"
+
+
 def test_a_refused_change_does_not_touch_the_others_of_its_commit(ledger: Ledger) -> None:
     ledger.store.append(record("event", "7", b"before"))
     gate = Gate(ledger.rows, waiting=15)

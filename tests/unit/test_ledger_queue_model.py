@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import tempfile
 from dataclasses import dataclass, field
@@ -10,16 +11,18 @@ from pathlib import Path
 
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
 
 from ledger_helpers import Clock, open_ledger, predict, record
 from vggt_motion.ledger.jobs import JobPolicy
 from vggt_motion.ledger.store import UnknownError
 from vggt_motion.records import DoneOutcome, JobKind, JobState, Lease
 
+# In memory where that is possible: the model asks what the rules do, other tests ask what the disk keeps.
+MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 LEASE_S = 10.0
 POLICY = JobPolicy(lease_duration_s=LEASE_S, max_failures=2, max_lost_leases=3, retry_backoff_s=1.0)
-NAMES = st.sampled_from([f"job{index}" for index in range(6)])
+NAMES = st.sampled_from([f"job{index}" for index in range(4)])
 WORKERS = st.sampled_from(["inference/a", "inference/b"])
 FINAL = (JobState.DONE, JobState.DEAD, JobState.CANCELLED)
 
@@ -48,7 +51,7 @@ class QueueMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.directory = Path(tempfile.mkdtemp(prefix="ledger-model-"))
+        self.directory = Path(tempfile.mkdtemp(prefix="ledger-model-", dir=MEMORY))
         self.clock = Clock()
         self.lease_count = 0
         self.jobs: dict[str, Model] = {}
@@ -56,7 +59,12 @@ class QueueMachine(RuleBasedStateMachine):
         self.deaths: list[str] = []
 
     @initialize()
-    def start(self) -> None:
+    def begin(self) -> None:
+        self.open()
+        self.submit("job0", 1)
+        self.submit("job1", 0)
+
+    def open(self) -> None:
         self.ledger = open_ledger(self.directory, self.clock, policy=POLICY, new_lease_id=self.new_lease_id)
 
     def new_lease_id(self) -> str:
@@ -107,7 +115,28 @@ class QueueMachine(RuleBasedStateMachine):
         if self.is_present(lease):
             self.jobs[lease.job.job_id].deadline_s = self.clock.now_s + LEASE_S
 
+    @rule(choice=st.integers(0, 3), content=st.binary(max_size=3))
+    def done_in_time(self, choice: int, content: bytes) -> None:
+        if lease := self.held(choice):
+            self.done(lease, content)
+
+    @rule(choice=st.integers(0, 3), is_permanent=st.sampled_from([False, False, True]))
+    def fail_in_time(self, choice: int, is_permanent: bool) -> None:
+        if lease := self.held(choice):
+            self.fail(lease, is_permanent)
+
+    def held(self, choice: int) -> Lease | None:
+        """One of the leases that are valid at present."""
+        names = [name for name, job in self.jobs.items() if job.lease_id]
+        if not names:
+            return None
+        name = names[choice % len(names)]
+        return Lease(predict(name), self.jobs[name].lease_id, attempt=1, duration_s=LEASE_S)
+
     @rule(lease=leases, content=st.binary(max_size=3))
+    def done_at_any_time(self, lease: Lease, content: bytes) -> None:
+        self.done(lease, content)
+
     def done(self, lease: Lease, content: bytes) -> None:
         name = lease.job.job_id
         job = self.jobs[name]
@@ -131,7 +160,10 @@ class QueueMachine(RuleBasedStateMachine):
             self.ledger.jobs.done(other, lease.lease_id, record("submap", other, b"wrong"))
             raise AssertionError("a lease on another job was accepted")
 
-    @rule(lease=consumes(leases), is_permanent=st.booleans())
+    @rule(lease=leases, is_permanent=st.booleans())
+    def fail_at_any_time(self, lease: Lease, is_permanent: bool) -> None:
+        self.fail(lease, is_permanent)
+
     def fail(self, lease: Lease, is_permanent: bool) -> None:
         job = self.jobs[lease.job.job_id]
         is_present = self.is_present(lease)
@@ -193,13 +225,13 @@ class QueueMachine(RuleBasedStateMachine):
             self.ledger.close()
         else:
             # As a power cut leaves it: the files as they are, without closing anything.
-            image = Path(tempfile.mkdtemp(prefix="ledger-model-"))
+            image = Path(tempfile.mkdtemp(prefix="ledger-model-", dir=MEMORY))
             shutil.copytree(self.directory, image, dirs_exist_ok=True)
             self.ledger.close()
             shutil.rmtree(self.directory)
             self.directory = image
         self.clock.now_s = 0.0
-        self.start()
+        self.open()
         for job in self.jobs.values():
             job.not_before_s = 0.0
             if job.state is JobState.LEASED:
@@ -227,4 +259,4 @@ class QueueMachine(RuleBasedStateMachine):
 
 
 TestQueue = QueueMachine.TestCase
-TestQueue.settings = settings(max_examples=40, stateful_step_count=40, deadline=None)
+TestQueue.settings = settings(max_examples=80, stateful_step_count=50, deadline=None)
