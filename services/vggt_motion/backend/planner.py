@@ -121,7 +121,8 @@ def _settled_estimate(state: LogState) -> tuple[int, FocalHint] | None:
         if hint is not None:
             return index, hint
     hint = estimate.hint()
-    if hint is None or not state.is_input_complete:
+    # An estimate that is worse than the deviation it is to judge cannot judge.
+    if hint is None or not state.is_input_complete or hint.relative_sigma > MAX_FOCAL_DEVIATION:
         return None
     return len(state.segments) - 1, hint
 

@@ -1,0 +1,156 @@
+"""The backend: follows the log, submits the jobs that it calls for, and solves the pose graph (DESIGN 3.6 and 4).
+
+All its state is a fold of the log: killed and started again, it plans the same jobs and solves the same graph.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from vggt_motion.backend import planner, posegraph
+from vggt_motion.backend.state import LogState
+from vggt_motion.bus import codec
+from vggt_motion.bus.log import LogFollower
+from vggt_motion.bus.service import ServiceContext, run_service
+from vggt_motion.compute import ComputeCancelledError, ComputeChild
+from vggt_motion.config import Config
+from vggt_motion.errors import BusUnavailableError, RequestRefusedError, VggtMotionError
+from vggt_motion.records import Constraint, GraphUpdate, Job, JobKind, Stream
+
+_log = logging.getLogger(__name__)
+_IDLE_S = 0.05
+_MAX_SOLVE_FAILURES = 3
+
+
+def main(config: Config) -> int:
+    """Run the backend until it is told to stop; returns the exit code of the process."""
+    return run_service("backend", config, lambda context: _Backend(context).serve())
+
+
+class _Backend:
+    def __init__(self, context: ServiceContext) -> None:
+        self._context = context
+        self._config = context.config
+        self._state = LogState()
+        self._log = LogFollower(context.bus)
+        self._child = ComputeChild("backend")
+        self._submitted: set[str] = set()
+        self._has_unsubmitted = False
+        self._solved_inputs = -1  # how many submaps and constraints the newest graph was solved from
+        self._solve_failures = 0
+
+    def serve(self) -> None:
+        try:
+            while not self._context.stopping.is_set():
+                if not self._pump() and not self._solve():
+                    self._context.stopping.wait(_IDLE_S)
+        except ComputeCancelledError:
+            return
+        finally:
+            self._child.kill()
+            self._log.close()
+
+    def _pump(self) -> bool:
+        """Take in what is new in the log and submit what it calls for; whether anything was new."""
+        records = self._log.poll()
+        for record in records:
+            self._state.apply(record)
+        if records or self._has_unsubmitted:
+            self._submit()
+            self._report()
+        return bool(records)
+
+    def _submit(self) -> None:
+        planned = [job for job in planner.next_jobs(self._state, self._config) if job.job_id not in self._submitted]
+        self._has_unsubmitted = bool(planned)
+        if not planned:
+            return
+        model = self._config.inference.predictor
+        jobs = [
+            Job(
+                job_id=job.job_id,
+                kind=job.kind,
+                payload=codec.encode(job.task),
+                payload_type=type(job.task).__name__,
+                priority=job.priority,
+                model=model if job.kind is JobKind.PREDICT else "",
+            )
+            for job in planned
+        ]
+        try:
+            self._context.jobs.submit(jobs)
+        except BusUnavailableError as error:
+            _log.warning("jobs not submitted yet", extra={"reason": str(error)})
+            return
+        self._submitted.update(job.job_id for job in planned)
+        self._has_unsubmitted = False
+
+    def _report(self) -> None:
+        state = self._state
+        graph = state.latest_graph()
+        self._context.set_health(
+            "ended" if graph is not None and graph.is_final else "working",
+            f"{len(state.segments)} segments, {len(state.submaps)} submaps, {len(state.constraints)} constraints",
+            segments=len(state.segments),
+            submaps=len(state.submaps),
+            constraints=len(state.constraints),
+            dead_jobs=len(state.dead_jobs),
+            graph_revision=graph.revision if graph is not None else -1,
+        )
+
+    def _solve(self) -> bool:
+        """Solve the graph if there is anything new to solve, or the final one when all is done; whether it did."""
+        state = self._state
+        graph = state.latest_graph()
+        if graph is not None and graph.is_final:
+            return False
+        is_final = planner.is_complete(state, self._config)
+        inputs = len(state.submaps) + len(state.constraints)
+        if not is_final and (inputs == 0 or inputs <= max(self._solved_inputs, graph.revision if graph else -1)):
+            return False
+        nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
+        constraints = planner.current_constraints(state)
+        try:
+            # The revision counts what went in, so that a backend that was killed and started again makes it again.
+            update = self._child.call(
+                _solve_graph,
+                nodes,
+                constraints,
+                self._config,
+                inputs,
+                is_final,
+                deadline_s=self._config.backend.solve_deadline_s,
+                on_tick=self._keep_up,
+            )
+        except ComputeCancelledError:
+            raise
+        except VggtMotionError as error:
+            self._solve_failures += 1
+            _log.error("the pose graph was not solved", extra={"reason": str(error), "final": is_final})
+            if self._solve_failures >= _MAX_SOLVE_FAILURES:
+                raise
+            time.sleep(_IDLE_S)
+            return True
+        self._solve_failures = 0
+        self._solved_inputs = inputs
+        try:
+            self._context.ledger.append(Stream.GRAPH, update.record_id, update)
+        except RequestRefusedError as error:
+            if is_final:
+                raise
+            # A backend before this one had seen as many records, but not the same ones: its graph stands for now.
+            _log.info("live graph not kept", extra={"reason": str(error)})
+        return True
+
+    def _keep_up(self) -> bool:
+        if self._context.stopping.is_set():
+            return False
+        self._pump()
+        return True
+
+
+def _solve_graph(
+    nodes: list[tuple[int, int]], constraints: list[Constraint], config: Config, revision: int, is_final: bool
+) -> GraphUpdate:
+    return posegraph.solve(nodes, constraints, config.backend, revision=revision, is_final=is_final)

@@ -1,0 +1,173 @@
+"""What every worker does around its numerics: claim, heartbeat, compute in a child, deliver (DESIGN section 4)."""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vggt_motion.bus.ledger import LedgerClient
+from vggt_motion.bus.service import ServiceContext
+from vggt_motion.compute import ComputeCancelledError, ComputeChild, ComputeError
+from vggt_motion.errors import BusUnavailableError, InputError, VggtMotionError
+from vggt_motion.records import BlobRef, JobKind, Lease, Stream
+
+_log = logging.getLogger(__name__)
+_CLAIM_WAIT_S = 1.0
+_RETRY_S = 0.5
+_HEARTBEATS_PER_LEASE = 4
+
+
+@dataclass(frozen=True)
+class Computation:
+    """A call for the child: a module-level function and its arguments."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    detail: str  # one line for status and log
+
+
+class BlobCache:
+    """Payloads of the last task: neighbouring tasks share most of theirs. Bounded by one task's payloads."""
+
+    def __init__(self, ledger: LedgerClient) -> None:
+        self._ledger = ledger
+        self._last: dict[str, bytes] = {}
+
+    def fetch(self, refs: Sequence[BlobRef]) -> list[bytes]:
+        """The payloads in the order of their references."""
+        current: dict[str, bytes] = {}
+        for ref in refs:
+            if ref.sha256 not in current:
+                known = self._last.get(ref.sha256)
+                current[ref.sha256] = self._ledger.blob(ref) if known is None else known
+        self._last = current
+        return [current[ref.sha256] for ref in refs]
+
+
+def work(
+    context: ServiceContext,
+    *,
+    kinds: Sequence[JobKind],
+    models: Sequence[str],
+    stream: Stream,
+    prepare: Callable[[Lease], Computation],
+    deadline_s: float,
+    warm_up: Computation | None = None,
+) -> None:
+    """Serve jobs until the service is told to stop.
+
+    Args:
+        context: of the service.
+        kinds: of jobs that this worker can do.
+        models: that it offers.
+        stream: that the results belong to.
+        prepare: fetches the inputs of a job; runs here and may use the bus. The function that it names returns the
+            record and the payloads that the record refers to.
+        deadline_s: seconds that one computation may take.
+        warm_up: called in the child once, so that its imports do not delay the first job.
+
+    Raises:
+        InputError: the warm-up failed: this worker cannot do its work as it is configured.
+    """
+    child = ComputeChild(f"{context.service}-{context.instance}")
+    done = failed = 0
+    try:
+        if warm_up is not None:
+            _warm_up(context, child, warm_up, deadline_s)
+        while not context.stopping.is_set():
+            context.set_health("idle", "", jobs_done=done, jobs_failed=failed)
+            try:
+                lease = context.jobs.claim(kinds, models, context.worker, _CLAIM_WAIT_S)
+            except BusUnavailableError as error:
+                context.set_health("waiting", str(error), jobs_done=done, jobs_failed=failed)
+                context.stopping.wait(_RETRY_S)
+                continue
+            if lease is None:
+                continue
+            if _carry_out(context, child, lease, stream, prepare, deadline_s):
+                done += 1
+            else:
+                failed += 1
+    except ComputeCancelledError:
+        return  # told to stop: the lease ends with our liveliness token and the job runs elsewhere
+    finally:
+        child.kill()
+
+
+def _warm_up(context: ServiceContext, child: ComputeChild, warm_up: Computation, deadline_s: float) -> None:
+    context.set_health("starting", warm_up.detail)
+    try:
+        child.call(
+            warm_up.function,
+            *warm_up.arguments,
+            deadline_s=deadline_s,
+            on_tick=lambda: not context.stopping.is_set(),
+        )
+    except ComputeCancelledError:
+        raise
+    except ComputeError as error:
+        raise InputError(str(error)) from error
+
+
+def _carry_out(
+    context: ServiceContext,
+    child: ComputeChild,
+    lease: Lease,
+    stream: Stream,
+    prepare: Callable[[Lease], Computation],
+    deadline_s: float,
+) -> bool:
+    job = lease.job
+    begin = time.monotonic()
+    try:
+        computation = prepare(lease)
+        context.set_health("working", computation.detail)
+        keeper = _LeaseKeeper(context, lease)
+        record, blobs = child.call(
+            computation.function, *computation.arguments, deadline_s=deadline_s, on_tick=keeper.tick
+        )
+        is_committed = context.jobs.done(lease, stream, record.record_id, record, blobs)
+    except ComputeCancelledError:
+        if context.stopping.is_set():
+            raise
+        _log.warning("lease lost, the job runs elsewhere", extra={"job": job.job_id})
+        return False
+    except BusUnavailableError as error:
+        _log.warning("link lost, the job will be repeated", extra={"job": job.job_id, "reason": str(error)})
+        return False
+    except VggtMotionError as error:
+        text = error.traceback_text if isinstance(error, ComputeError) else traceback.format_exc()
+        _log.warning("job failed", extra={"job": job.job_id, "attempt": lease.attempt, "reason": str(error)})
+        try:
+            context.jobs.fail(lease, str(error), text)
+        except VggtMotionError as report_error:
+            _log.warning("failure not reported", extra={"job": job.job_id, "reason": str(report_error)})
+        return False
+    seconds = time.monotonic() - begin
+    _log.info("job done", extra={"job": job.job_id, "seconds": round(seconds, 3), "committed": is_committed})
+    return True
+
+
+class _LeaseKeeper:
+    """Sends heartbeats from the worker's own loop: a worker that hangs loses its lease, one that computes does not."""
+
+    def __init__(self, context: ServiceContext, lease: Lease) -> None:
+        self._context, self._lease = context, lease
+        self._interval_s = lease.duration_s / _HEARTBEATS_PER_LEASE
+        self._next = time.monotonic() + self._interval_s
+
+    def tick(self) -> bool:
+        """Whether to go on; sends a heartbeat when one is due."""
+        if self._context.stopping.is_set():
+            return False
+        if time.monotonic() < self._next:
+            return True
+        self._next = time.monotonic() + self._interval_s
+        try:
+            return self._context.jobs.heartbeat(self._lease.lease_id)
+        except BusUnavailableError:
+            return True  # the link may come back before the result is there, and a late result is still worth something

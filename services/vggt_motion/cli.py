@@ -1,0 +1,192 @@
+"""The command ``vggt-motion``. Every error that we know ends as one clear line and an exit code (DESIGN section 5)."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+from rich.console import Console
+
+from vggt_motion import __version__
+from vggt_motion.config import load_config
+from vggt_motion.errors import InputError, VggtMotionError
+
+app = typer.Typer(
+    name="vggt-motion",
+    help="Globally consistent trajectory and dense map from uncalibrated monocular video.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+config_app = typer.Typer(help="The configuration.", no_args_is_help=True)
+app.add_typer(config_app, name="config")
+ledger_app = typer.Typer(help="The ledger of a session.", no_args_is_help=True)
+app.add_typer(ledger_app, name="ledger")
+
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML file with any part of the configuration.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Set one value; may be repeated.")
+]
+INTERRUPTED_EXIT_CODE = 130
+Value = TypeVar("Value")
+
+SERVICES = ("router", "ledger", "frontend", "inference", "registration", "backend", "gateway", "recorder")
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=lambda on: _version(on), is_eager=True),
+    ] = False,
+) -> None: ...
+
+
+def _version(is_wanted: bool) -> None:
+    if is_wanted:
+        Console().print(f"vggt-motion {__version__}", highlight=False)
+        raise typer.Exit
+
+
+@app.command()
+def run(
+    source: Annotated[str, typer.Argument(help="Image folder, KITTI folder, video file or MCAP recording.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default out/<name of the source>.")] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame to use.")] = 0,
+    end: Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")] = None,
+    stride: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
+    ego_mask: Annotated[
+        Path | None, typer.Option(help="PNG of the frames' size, non-zero over bonnet, logo or overlay.")
+    ] = None,
+    known_distance: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Travelled distance, if known: sets the scale.")
+    ] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(help="KITTI or TUM trajectory to compare with; adds ATE, drift and an overlay.")
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Discard what an earlier run left in the folder.")] = False,
+) -> None:
+    """Turn a video into a trajectory and a map, with all services on this machine."""
+    from vggt_motion.launch import RunRequest
+    from vggt_motion.run import run_to_results
+
+    values = list(assignments or ())
+    if known_distance is not None:
+        values.append(f"backend.known_distance_m={known_distance}")
+    request = RunRequest(
+        source=source,
+        out=out if out is not None else Path("out") / (Path(source).stem or "run"),
+        config=load_config(config, values),
+        start=start,
+        end=end,
+        stride=stride,
+        ego_mask=ego_mask,
+    )
+    raise typer.Exit(run_to_results(request, ground_truth=ground_truth, fresh=fresh))
+
+
+@app.command()
+def serve(
+    name: Annotated[str, typer.Argument(metavar="NAME", help=f"One of: {', '.join(SERVICES)}.")],
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    directory: Annotated[Path | None, typer.Option(help="ledger, recorder: folder of the session.")] = None,
+    source: Annotated[str | None, typer.Option(help="frontend: what to read.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="frontend: first frame.")] = 0,
+    end: Annotated[int | None, typer.Option(min=1, help="frontend: frame to stop before.")] = None,
+    stride: Annotated[int, typer.Option(min=1, help="frontend: every n-th frame.")] = 1,
+    ego_mask: Annotated[Path | None, typer.Option(help="frontend: mask PNG.")] = None,
+    parent_pid: Annotated[int | None, typer.Option(hidden=True)] = None,
+) -> None:
+    """Run one service in this process; they find one another through the router at ``bus.endpoint``."""
+    if name not in SERVICES:
+        raise InputError(f"unknown service '{name}': known are {', '.join(SERVICES)}")
+    if parent_pid is not None:
+        from vggt_motion.supervise import watch_parent
+
+        watch_parent(parent_pid)
+    settings = load_config(config, list(assignments or ()))
+    # Imported by need: the camera side carries neither gtsam nor a predictor, and start-up is paid by every process.
+    match name:
+        case "router":
+            from vggt_motion.bus import router
+
+            code = router.main(settings)
+        case "ledger":
+            from vggt_motion.ledger import service as ledger
+
+            code = ledger.main(settings, directory=_needed(directory, name, "--directory"))
+        case "frontend":
+            from vggt_motion.frontend import service as frontend
+
+            code = frontend.main(
+                settings,
+                source=_needed(source, name, "--source"),
+                start=start,
+                end=end,
+                stride=stride,
+                ego_mask=ego_mask,
+            )
+        case "inference":
+            from vggt_motion.inference import service as inference
+
+            code = inference.main(settings)
+        case "registration":
+            from vggt_motion.registration import service as registration
+
+            code = registration.main(settings)
+        case "backend":
+            from vggt_motion.backend import service as backend
+
+            code = backend.main(settings)
+        case "gateway":
+            from vggt_motion.gateway import service as gateway
+
+            code = gateway.main(settings)
+        case _:
+            from vggt_motion.recorder import service as recorder
+
+            code = recorder.main(settings, directory=_needed(directory, name, "--directory"))
+    raise typer.Exit(code)
+
+
+def _needed(value: Value | None, service: str, option: str) -> Value:
+    if value is None:
+        raise InputError(f"service {service} needs {option}")
+    return value
+
+
+@config_app.command("dump")
+def config_dump(config: ConfigOption = None, assignments: SetOption = None) -> None:
+    """Print the effective configuration as YAML."""
+    sys.stdout.write(load_config(config, list(assignments or ())).to_yaml())
+
+
+def main() -> None:
+    """Entry point of the command: runs it and turns errors into one line and an exit code."""
+    logging.captureWarnings(True)
+    try:
+        code = app(standalone_mode=False)
+    except typer.Exit as stop:
+        code = stop.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        code = INTERRUPTED_EXIT_CODE
+    except typer.TyperException as error:
+        _complain(error.format_message())
+        code = InputError.exit_code
+    except VggtMotionError as error:
+        _complain(str(error))
+        code = error.exit_code
+    except BrokenPipeError:
+        code = 1  # whoever read our output has gone
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complain(message: str) -> None:
+    sys.stderr.write(f"vggt-motion: {' '.join(message.split())}\n")

@@ -1,0 +1,336 @@
+"""All services of one session on this machine, for ``vggt-motion run`` (DESIGN section 4)."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+
+from vggt_motion.backend.state import LogState
+from vggt_motion.bus.liveliness import ServiceWatch
+from vggt_motion.bus.log import LogFollower
+from vggt_motion.bus.session import Bus, open_bus
+from vggt_motion.config import BusConfig, Config
+from vggt_motion.errors import BusError, InputError, VggtMotionError
+from vggt_motion.records import HealthReport, MotionState
+from vggt_motion.sources.registry import open_source
+from vggt_motion.supervise import ServiceCommand, Supervisor
+
+_log = logging.getLogger(__name__)
+_TICK_S = 0.05
+_STATUS_INTERVAL_S = 0.5
+_START_TIMEOUT_S = 60.0
+_RECORDER_TIMEOUT_S = 30.0
+CONFIG_FILE = "config.yaml"
+LEDGER_FOLDER = "ledger"
+LOG_FOLDER = "logs"
+_IDENTITY_KEY = "run_identity"
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What the user asked for."""
+
+    source: str
+    out: Path
+    config: Config
+    start: int = 0
+    end: int | None = None
+    stride: int = 1
+    ego_mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What the display shows."""
+
+    frame_count: int | None  # of the source, None = unknown
+    frames: int
+    keyframes: int
+    segments: int
+    submaps: int
+    constraints: int
+    state: MotionState | None
+    lag_submaps: int  # closed segments that have no submap yet
+    dead_jobs: int
+    is_input_complete: bool
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """How the run ended; the log is folded into ``state``."""
+
+    state: LogState
+    exit_code: int
+    interrupted: bool
+    seconds: float
+    start_up_seconds: float
+    restart_count: int
+
+
+def run_identity(request: RunRequest, fingerprint: str) -> str:
+    """What makes two runs the same one: the input, the part of it, and everything that decides the result."""
+    config = request.config
+    mask = hashlib.sha256(request.ego_mask.read_bytes()).hexdigest() if request.ego_mask is not None else None
+    identity = {
+        "source": fingerprint,
+        "selection": [request.start, request.end, request.stride],
+        "ego_mask": mask,
+        "camera": config.run.camera,
+        "method": {
+            name: getattr(config, name).model_dump(mode="json")
+            for name in ("frontend", "inference", "registration", "loops", "backend")
+        },
+    }
+    return json.dumps(identity, sort_keys=True)
+
+
+def free_port(host: str = "127.0.0.1") -> int:
+    """A TCP port that nobody listens on at this moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+def check_port(host: str, port: int) -> None:
+    """Raise InputError with one clear line when the gateway's port cannot be had."""
+    if port == 0:
+        return
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise InputError(
+                f"port {port} on {host} cannot be used for the gateway ({error.strerror}): "
+                f"choose another one with --set gateway.port=N, or 0 for any"
+            ) from error
+
+
+def with_free_endpoint(config: Config) -> Config:
+    """The configuration with a router endpoint of its own, unless the user chose one."""
+    if config.bus.endpoint != BusConfig.model_fields["endpoint"].default:
+        return config
+    bus = config.bus.model_copy(update={"endpoint": f"tcp/127.0.0.1:{free_port()}"})
+    return config.model_copy(update={"bus": bus})
+
+
+def service_commands(request: RunRequest, config_file: Path) -> list[ServiceCommand]:
+    """The processes of a run, in the order in which to start them."""
+    config = request.config
+    common = ("--config", str(config_file))
+    ledger = str(request.out / LEDGER_FOLDER)
+    commands = [
+        ServiceCommand("router", "router", ("router", *common), tier=0),
+        ServiceCommand("ledger", "ledger", ("ledger", *common, "--directory", ledger), tier=1),
+    ]
+    if config.recorder.enabled:
+        recorder = ("recorder", *common, "--directory", str(request.out))
+        commands.append(ServiceCommand("recorder", "recorder", recorder, tier=2))
+    for name, count in (
+        ("inference", config.run.inference_workers),
+        ("registration", config.run.registration_workers),
+        ("backend", 1),
+        ("gateway", 1),
+    ):
+        for number in range(count):
+            label = name if count == 1 else f"{name}-{number}"
+            commands.append(ServiceCommand(name, label, (name, *common), tier=3))
+    frontend = ["frontend", *common, "--source", request.source]
+    frontend += ["--start", str(request.start), "--stride", str(request.stride)]
+    if request.end is not None:
+        frontend += ["--end", str(request.end)]
+    if request.ego_mask is not None:
+        frontend += ["--ego-mask", str(request.ego_mask)]
+    commands.append(ServiceCommand("frontend", "frontend", tuple(frontend), tier=4, ends_by_itself=True))
+    return commands
+
+
+class LocalRun:
+    """One session with all its processes on this machine."""
+
+    def __init__(self, request: RunRequest) -> None:
+        """Check what can be checked before anything is started; writes nothing.
+
+        Raises:
+            InputError: the source, the mask or the gateway's port cannot be used.
+        """
+        source = open_source(request.source, start=request.start, end=request.end, stride=request.stride)
+        self.source_description = source.description
+        self._frame_count = source.frame_count
+        fingerprint = source.fingerprint
+        source.close()
+        if request.ego_mask is not None and not request.ego_mask.is_file():
+            raise InputError(f"no ego mask at {request.ego_mask}")
+        self.identity = run_identity(request, fingerprint)
+        check_port(request.config.gateway.host, request.config.gateway.port)
+        config = with_free_endpoint(request.config)
+        self._request = replace(request, config=config)
+        self._interrupts = 0
+
+    @property
+    def config(self) -> Config:
+        """The effective configuration."""
+        return self._request.config
+
+    def execute(self, on_progress: Callable[[Progress], None], finish: Callable[[RunOutcome, Bus], None]) -> RunOutcome:
+        """Run to the end, or until Ctrl-C.
+
+        Args:
+            on_progress: called twice a second.
+            finish: called with the outcome while the ledger still answers.
+
+        Raises:
+            InputError: the output folder cannot be written, or a service refused its input.
+            VggtMotionError: a service keeps crashing.
+        """
+        request, config = self._request, self.config
+        config_file = request.out / CONFIG_FILE
+        try:
+            for folder in (LEDGER_FOLDER, LOG_FOLDER):
+                (request.out / folder).mkdir(parents=True, exist_ok=True)
+            config_file.write_text(config.to_yaml(), encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot write to {request.out}: {error.strerror or error}") from error
+        token = config.gateway.token
+        environment = {"VGGT_MOTION_GATEWAY__TOKEN": token} if token is not None else {}
+        commands = service_commands(request, config_file)
+        begin = time.monotonic()
+        with self._interruptible(), Supervisor(commands, request.out / LOG_FOLDER, environment) as supervisor:
+            supervisor.start([command.label for command in commands if command.name != "frontend"])
+            bus = self._join(supervisor)
+            try:
+                watch = ServiceWatch(bus)
+                self._wait_for(supervisor, watch, commands)
+                start_up_seconds = time.monotonic() - begin
+                supervisor.start(["frontend"])
+                state = self._follow(supervisor, bus, watch, on_progress)
+                outcome = RunOutcome(
+                    state=state,
+                    exit_code=supervisor.exit_code("frontend") or 0,
+                    interrupted=self._interrupts > 0,
+                    seconds=time.monotonic() - begin,
+                    start_up_seconds=start_up_seconds,
+                    restart_count=supervisor.restart_count,
+                )
+                finish(outcome, bus)
+            finally:
+                bus.close()
+        return outcome
+
+    @contextlib.contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        def interrupt(_: int, __: FrameType | None) -> None:
+            self._interrupts += 1
+            if self._interrupts > 1:
+                raise KeyboardInterrupt
+
+        previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _join(self, supervisor: Supervisor) -> Bus:
+        """Open our own session as soon as the router listens, and notice when it never will."""
+        end = time.monotonic() + _START_TIMEOUT_S
+        impatient = self.config.bus.model_copy(update={"connect_timeout_s": 1.0})
+        while True:
+            supervisor.poll()
+            try:
+                return open_bus(impatient)
+            except BusError:
+                if time.monotonic() > end or self._interrupts:
+                    raise
+
+    def _wait_for(self, supervisor: Supervisor, watch: ServiceWatch, commands: list[ServiceCommand]) -> None:
+        """Wait until all services but the frontend are alive, so that nothing that it sends is missed."""
+        wanted = {command.name for command in commands} - {"frontend", "router"}
+        end = time.monotonic() + _START_TIMEOUT_S
+        while not self._interrupts:
+            alive = {service for service, _ in watch.services()}
+            if wanted <= alive:
+                return
+            supervisor.poll()
+            if time.monotonic() > end:
+                raise VggtMotionError(f"not ready after {_START_TIMEOUT_S:.0f} s: {', '.join(sorted(wanted - alive))}")
+            time.sleep(_TICK_S)
+
+    def _follow(
+        self, supervisor: Supervisor, bus: Bus, watch: ServiceWatch, on_progress: Callable[[Progress], None]
+    ) -> LogState:
+        """Fold the log until the final graph is there and the recorder has it all, or until Ctrl-C."""
+        state = LogState()
+        follower = LogFollower(bus)
+        next_status = 0.0
+        finished_at: float | None = None
+        try:
+            while not self._interrupts:
+                supervisor.poll()
+                for record in follower.poll():
+                    state.apply(record)
+                now = time.monotonic()
+                if now >= next_status:
+                    next_status = now + _STATUS_INTERVAL_S
+                    on_progress(self._progress(state, watch))
+                graph = state.latest_graph()
+                if graph is not None and graph.is_final and supervisor.exit_code("frontend") is not None:
+                    finished_at = finished_at or now
+                    if self._is_recorded(watch, follower, state):
+                        break
+                    if now - finished_at > _RECORDER_TIMEOUT_S:
+                        _log.warning("the recorder did not catch up in time; the recording may lack its end")
+                        break
+                time.sleep(_TICK_S)
+            on_progress(self._progress(state, watch))
+        finally:
+            follower.close()
+        return state
+
+    def _is_recorded(self, watch: ServiceWatch, follower: LogFollower, state: LogState) -> bool:
+        if not self.config.recorder.enabled:
+            return True
+        report = _newest(watch, "recorder")
+        if report is None:
+            return False
+        ended = state.stream_ended
+        frame_count = int(ended.detail["frame_count"]) if ended is not None else 0
+        positions = follower.positions()
+        return report.counters.get("frames", 0) >= frame_count and all(
+            report.counters.get(f"position_{stream.value}", 0) >= position for stream, position in positions.items()
+        )
+
+    def _progress(self, state: LogState, watch: ServiceWatch) -> Progress:
+        frontend = _newest(watch, "frontend")
+        counters = frontend.counters if frontend is not None else {}
+        newest = max(state.keyframes.values(), key=lambda keyframe: keyframe.frame_index, default=None)
+        predicted = {index for index, _ in state.submaps}
+        ended = state.stream_ended
+        frames = int(ended.detail["frame_count"]) if ended is not None else int(counters.get("frames", 0))
+        return Progress(
+            frame_count=self._frame_count,
+            frames=frames,
+            keyframes=len(state.keyframes),
+            segments=len(state.segments),
+            submaps=len(predicted),
+            constraints=sum(1 for constraint in state.constraints.values() if constraint.accepted),
+            state=newest.state if newest is not None else None,
+            lag_submaps=len(state.segments.keys() - predicted),
+            dead_jobs=len(state.dead_jobs),
+            is_input_complete=state.is_input_complete,
+        )
+
+
+def _newest(watch: ServiceWatch, service: str) -> HealthReport | None:
+    reports = [report for (name, _), report in watch.services().items() if name == service and report is not None]
+    return max(reports, key=lambda report: report.time_ns, default=None)

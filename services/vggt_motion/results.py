@@ -1,0 +1,355 @@
+"""What a run leaves in its folder: trajectories, map, report, metrics."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vggt_motion import __version__
+from vggt_motion.backend import focal
+from vggt_motion.backend.map import PointMap, build_map
+from vggt_motion.backend.map_frames import map_frames
+from vggt_motion.backend.state import LogState
+from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
+from vggt_motion.config import Config
+from vggt_motion.errors import InputError
+from vggt_motion.evaluation import metrics as evaluation
+from vggt_motion.evaluation.report import write_report
+from vggt_motion.evaluation.report_data import (
+    CameraView,
+    ComponentTrack,
+    GroundTruth,
+    PointCloud,
+    ReportData,
+    empty_track,
+)
+from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_kitti, to_tum
+from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.geometry.track import PoseTrack
+from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, ScaleKind, SubmapVerdict
+
+METRICS_FILE = "metrics.json"
+_MIN_ALIGNED_POSES = 3
+_PACKAGES = ("eclipse-zenoh", "opencv-python-headless", "pycolmap", "gtsam", "numpy", "protobuf", "mcap")
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What the results need to know of a run beside its log."""
+
+    source: str
+    exit_code: int
+    interrupted: bool
+    wall_seconds: float
+    start_up_seconds: float
+    restart_count: int
+    first_frame: int = 0  # of the source, with --start and --stride: which line of the ground truth frame n belongs to
+    stride: int = 1
+    dead_jobs: tuple[JobReport, ...] = ()
+
+
+def read_ground_truth(path: Path) -> PoseTrack | list[PoseTrack]:
+    """Read a reference trajectory: KITTI (twelve numbers a line) or TUM (eight).
+
+    Returns:
+        A track with times for TUM; for KITTI, which has none, a list with the one track, to be matched by frame index.
+
+    Raises:
+        InputError: the file cannot be read or is of neither form.
+    """
+    try:
+        first = next(
+            (line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()[:1] not in "#"), ""
+        )
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read ground truth {path}: {error}") from error
+    return [read_kitti(path)] if len(first.split()) == 12 else read_tum(path)
+
+
+def write_results(
+    out: Path,
+    state: LogState,
+    config: Config,
+    facts: RunFacts,
+    load_blob: Callable[[BlobRef], bytes],
+    ground_truth: PoseTrack | list[PoseTrack] | None,
+) -> dict[str, Any]:
+    """Compose the trajectory and write every file of the folder; ``metrics.json`` comes last, complete or not at all.
+
+    Args:
+        out: folder, which exists.
+        state: the log, folded.
+        config: the effective configuration.
+        facts: of the run.
+        load_blob: fetches a payload.
+        ground_truth: as :func:`read_ground_truth` returned it.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    graph = state.latest_graph() or GraphUpdate(0, False, (), ())
+    submaps = state.usable_submaps()
+    segments = tuple(state.segments[index] for index in sorted(state.segments))
+    trajectory = compose(
+        list(state.keyframes.values()), segments, submaps, graph, known_distance_m=config.backend.known_distance_m
+    )
+    is_metric = bool(submaps) and all(g.scale_kind is ScaleKind.METRIC for g in submaps.values())
+    has_metres = is_metric or config.backend.known_distance_m is not None
+    component = _main_component(trajectory)
+    cloud = _build_cloud(state, graph, trajectory, component, config, load_blob)
+    reference = _reference_of(trajectory, ground_truth, facts)
+    metrics = _metrics(state, trajectory, facts, component, has_metres=has_metres)
+    truth = None
+    if reference is not None:
+        metrics["ground_truth"] = _errors(trajectory, reference, component)
+        truth = GroundTruth(reference, _alignments(trajectory, reference))
+    data = ReportData(
+        source=facts.source,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        length_unit="m" if has_metres else "units",
+        segments=segments,
+        submaps=tuple(state.submaps[key] for key in sorted(state.submaps)),
+        constraints=tuple(constraint for _, constraint in sorted(state.constraints.items())),
+        graph=state.latest_graph(),
+        keyframes=_component_track(trajectory.keyframes),
+        frames=_component_track(trajectory.frames),
+        ground_truth=truth,
+        cloud=None if cloud is None else PointCloud(cloud.points, cloud.colors, component),
+        camera_view=_camera_view(state, trajectory, component, load_blob),
+        metrics=metrics,
+        stage_seconds=_stage_seconds(state, facts),
+        events=tuple(state.events.values()),
+        dead_jobs=facts.dead_jobs,
+        min_inlier_ratio=config.registration.min_inlier_ratio,
+        config_yaml=config.to_yaml(),
+        versions=_versions(),
+    )
+    try:
+        _write(out / "trajectory_keyframes.tum", to_tum(trajectory.track("key")))
+        _write(out / "trajectory_frames.tum", to_tum(trajectory.track("all")))
+        _write(out / "trajectory_frames.kitti", to_kitti(trajectory.track("all")))
+        if cloud is not None:
+            cloud.write_ply(out / "map.ply")
+        write_report(out, data)
+        _write(out / METRICS_FILE, json.dumps(_finite(metrics), indent=2) + "\n")
+    except OSError as error:
+        raise InputError(f"cannot write results to {out}: {error.strerror or error}") from error
+    return metrics
+
+
+def _write(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)  # noqa: PTH105 - replaces atomically on every system
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN: what is not known is null."""
+    if isinstance(value, Mapping):
+        return {name: _finite(item) for name, item in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _main_component(trajectory: Trajectory) -> int:
+    """The connected part with the most frames; the first of equals."""
+    counts = Counter(frame.component for frame in trajectory.frames if frame.component != NO_COMPONENT)
+    return min(counts, key=lambda component: (-counts[component], component), default=NO_COMPONENT)
+
+
+def _component_track(frames: tuple[TrajectoryPose, ...]) -> ComponentTrack:
+    posed = [frame for frame in frames if frame.world_from_camera is not None]
+    if not posed:
+        return empty_track()
+    track = PoseTrack(
+        np.array([frame.capture_time_ns for frame in posed], dtype=np.int64),
+        np.array([frame.world_from_camera for frame in posed], dtype=np.float64),
+    )
+    return ComponentTrack(track, np.array([frame.component for frame in posed], dtype=np.int64))
+
+
+def _build_cloud(
+    state: LogState,
+    graph: GraphUpdate,
+    trajectory: Trajectory,
+    component: int,
+    config: Config,
+    load_blob: Callable[[BlobRef], bytes],
+) -> PointMap | None:
+    if component == NO_COMPONENT or not graph.poses:
+        return None
+    steps = np.linalg.norm(np.diff(trajectory.track("key", component).positions, axis=0), axis=1)
+    moving = steps[steps > 0.0]
+    frames = map_frames(state.keyframes, state.usable_submaps(), graph, component, load_blob)
+    step = float(np.median(moving)) if len(moving) else 0.0
+    return build_map(frames, config.backend, step=step, scale=trajectory.scale)
+
+
+def _camera_view(
+    state: LogState, trajectory: Trajectory, component: int, load_blob: Callable[[BlobRef], bytes]
+) -> CameraView | None:
+    """The middle keyframe of the main part: the report draws the map as this camera saw it."""
+    submaps = state.usable_submaps()
+    chosen = [frame for frame in trajectory.keyframes if frame.component == component]
+    for frame in chosen[len(chosen) // 2 :]:
+        keyframe_id = f"{frame.camera}/{frame.epoch}/{frame.frame_index:08d}"
+        geometry = next((found for s in submaps.values() if (found := s.frame(keyframe_id)) is not None), None)
+        if geometry is None or frame.world_from_camera is None:
+            continue
+        image = cv2.imdecode(np.frombuffer(load_blob(state.keyframes[keyframe_id].image), np.uint8), cv2.IMREAD_COLOR)
+        pixels = None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        return CameraView(frame.frame_index, frame.world_from_camera, geometry.intrinsics, pixels)
+    return None
+
+
+def _reference_of(
+    trajectory: Trajectory, ground_truth: PoseTrack | list[PoseTrack] | None, facts: RunFacts
+) -> PoseTrack | None:
+    """The ground truth with the capture times of our frames, where it has none of its own."""
+    if ground_truth is None or isinstance(ground_truth, PoseTrack):
+        return ground_truth
+    poses = ground_truth[0].world_from_camera
+    lines = [facts.first_frame + frame.frame_index * facts.stride for frame in trajectory.frames]
+    pairs = [
+        (frame.capture_time_ns, line) for frame, line in zip(trajectory.frames, lines, strict=True) if line < len(poses)
+    ]
+    times = np.array([time for time, _ in pairs], dtype=np.int64)
+    return PoseTrack(times, poses[np.array([line for _, line in pairs], dtype=np.intp)])
+
+
+def _alignments(trajectory: Trajectory, reference: PoseTrack) -> dict[int, Sim3]:
+    aligned = {}
+    for component in trajectory.components:
+        try:
+            errors = evaluation.evaluate(reference, trajectory.track("all", component))
+        except InputError:
+            continue
+        if errors.matched_count >= _MIN_ALIGNED_POSES:
+            aligned[component] = errors.ate_sim3.reference_from_estimate
+    return aligned
+
+
+def _errors(trajectory: Trajectory, reference: PoseTrack, component: int) -> dict[str, Any]:
+    """Errors of the main part; how much of the drive that is stands beside them."""
+    try:
+        frames = evaluation.evaluate(reference, trajectory.track("all", component))
+        keyframes = evaluation.evaluate(reference, trajectory.track("key", component))
+    except InputError as error:
+        return {"not_evaluated": str(error)}
+    return {
+        "ate_rmse_m": frames.ate_sim3.position_m.rmse,
+        "ate_max_m": frames.ate_sim3.position_m.max,
+        "ate_rmse_keyframes_m": keyframes.ate_sim3.position_m.rmse,
+        "ate_rmse_se3_m": frames.ate_se3.position_m.rmse,
+        "drift_ate_percent": frames.ate_sim3.drift_ate_percent,
+        "t_rel_percent": frames.kitti.t_rel_percent,
+        "r_rel_deg_per_100m": frames.kitti.r_rel_deg_per_100m,
+        "rpe_translation_rmse_m": frames.rpe.translation_m.rmse,
+        "rpe_rotation_rmse_deg": frames.rpe.rotation_deg.rmse,
+        "reference_length_m": frames.reference_length_m,
+        "evaluated_frame_count": frames.matched_count,
+        "reference_frame_count": len(reference),
+    }
+
+
+def _metrics(
+    state: LogState, trajectory: Trajectory, facts: RunFacts, component: int, *, has_metres: bool
+) -> dict[str, Any]:
+    submaps = state.usable_submaps()
+    verdicts = Counter(_newest_verdicts(state).values())
+    constraints = state.constraints.values()
+    graph = state.latest_graph()
+    ended = state.stream_ended
+    hint = focal.fold(
+        state.submaps[index, 1].quality if (index, 1) in state.submaps else None for index in sorted(state.segments)
+    ).hint()
+    states = Counter(frame.state.name.lower() for frame in trajectory.frames)
+    unit = "m" if has_metres else "units"
+    return {
+        "version": __version__,
+        "source": facts.source,
+        "exit_code": facts.exit_code,
+        "is_complete": graph is not None and graph.is_final and not facts.interrupted,
+        "truncated": ended.detail.get("truncated", "") if ended is not None else "",
+        "frame_count": len(trajectory.frames),
+        "keyframe_count": len(state.keyframes),
+        "segment_count": len(state.segments),
+        "submap_count": len(submaps),
+        "submaps": {verdict.value: verdicts[verdict] for verdict in SubmapVerdict if verdicts[verdict]},
+        "accepted_constraint_count": sum(constraint.accepted for constraint in constraints),
+        "refused_constraint_count": sum(not constraint.accepted for constraint in constraints),
+        "dead_job_count": len(state.dead_jobs),
+        "component_count": len(trajectory.components),
+        "main_component": component,
+        "break_count": len(graph.breaks) if graph is not None else 0,
+        f"path_length_{unit}": trajectory.path_length(),
+        "pose_origins": {origin.value: count for origin, count in sorted(trajectory.origin_counts().items())},
+        "motion_states": dict(sorted(states.items())),
+        "focal_over_width": hint.focal_over_width if hint is not None else None,
+        "focal_relative_sigma": hint.relative_sigma if hint is not None else None,
+        "wall_seconds": facts.wall_seconds,
+        "start_up_seconds": facts.start_up_seconds,
+        "restart_count": facts.restart_count,
+        "warnings": warnings(state, trajectory),
+    }
+
+
+def _newest_verdicts(state: LogState) -> dict[int, SubmapVerdict]:
+    return {index: state.submaps[index, revision].verdict for index, revision in sorted(state.submaps)}
+
+
+def warnings(state: LogState, trajectory: Trajectory) -> list[str]:
+    """What a person should know before trusting the result, one line each."""
+    lines = [event.message for event in state.events.values() if event.kind is EventKind.WARNING]
+    ended = state.stream_ended
+    if ended is not None and ended.detail.get("truncated"):
+        lines.append(f"the input ended early: {ended.detail['truncated']}")
+    if trajectory.frames and trajectory.path_length() == 0.0:
+        lines.append("the camera did not move, or nothing shows that it did: all poses are the same")
+    graph = state.latest_graph()
+    lines.extend(graph.breaks if graph is not None else ())
+    for index, verdict in _newest_verdicts(state).items():
+        if verdict is not SubmapVerdict.GOOD:
+            reasons = [g.reason for (k, _), g in sorted(state.submaps.items()) if k == index and g.reason]
+            lines.append(
+                f"submap {index} is {verdict.value.replace('_', ' ')}" + (f": {reasons[-1]}" if reasons else "")
+            )
+    lines.extend(f"job {job_id} was given up: {event.message}" for job_id, event in sorted(state.dead_jobs.items()))
+    missing = sum(frame.world_from_camera is None for frame in trajectory.frames)
+    if missing:
+        lines.append(f"{missing} of {len(trajectory.frames)} frames have no pose")
+    return lines
+
+
+def _stage_seconds(state: LogState, facts: RunFacts) -> dict[str, float]:
+    totals: dict[str, float] = defaultdict(float)
+    for geometry in state.submaps.values():
+        for stage, seconds in geometry.stage_seconds.items():
+            totals[stage.removesuffix("_s").replace("_", " ")] += seconds
+    slowest_first = sorted(totals.items(), key=lambda item: -item[1])
+    stages = {f"prediction: {name}": seconds for name, seconds in slowest_first}
+    return {"start-up": facts.start_up_seconds, "whole run": facts.wall_seconds, **stages}
+
+
+def _versions() -> dict[str, str]:
+    found = {"vggt-motion": __version__, "Python": platform.python_version(), "platform": platform.platform()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found

@@ -1,0 +1,228 @@
+"""The command ``vggt-motion run``: what was there before, live progress, results, and the summary at the end."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from vggt_motion import launch, results
+from vggt_motion.bus.jobs import JobClient
+from vggt_motion.bus.ledger import LedgerClient
+from vggt_motion.bus.session import Bus
+from vggt_motion.errors import InputError, SourceTruncatedError
+from vggt_motion.geometry.track import PoseTrack
+from vggt_motion.ledger.directory import locked
+from vggt_motion.records import JobState, MotionState
+
+INTERRUPTED_EXIT_CODE = 130
+_IDENTITY_FILE = "run.json"
+_FILES = (
+    _IDENTITY_FILE,
+    results.METRICS_FILE,
+    launch.CONFIG_FILE,
+    "trajectory_keyframes.tum",
+    "trajectory_frames.tum",
+    "trajectory_frames.kitti",
+    "map.ply",
+    "report.html",
+    "run.mcap",
+)
+_STATE_NAMES = {MotionState.STATIC: "standing", MotionState.TURNING: "turning", MotionState.LINEAR: "straight"}
+
+
+def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fresh: bool) -> int:
+    """Run a source to its results, continue an unfinished run, or show a finished one again.
+
+    Args:
+        request: what to run.
+        ground_truth: trajectory to compare with.
+        fresh: discard what an earlier run left in the folder.
+
+    Returns:
+        The exit code: 0; 3 when the input ended early; 130 after Ctrl-C.
+
+    Raises:
+        InputError: nothing can be made of this source, or the folder belongs to another run.
+        VggtMotionError: a service could not be kept running.
+    """
+    reference = results.read_ground_truth(ground_truth) if ground_truth is not None else None
+    console = Console(stderr=True, highlight=False)
+    run = launch.LocalRun(request)
+    finished = _claim_folder(request.out, run.identity, fresh=fresh)
+    if finished is not None and (reference is None or "ground_truth" in finished):
+        console.print(f"This run is finished already (in {request.out}); --fresh runs it again.")
+        _summarise(console, request.out, finished)
+        return int(finished["exit_code"])
+
+    metrics: dict[str, Any] = {}
+
+    def finish(outcome: launch.RunOutcome, bus: Bus) -> None:
+        metrics.update(_write_results(request, run, outcome, bus, reference))
+
+    with _display(console, run.source_description) as on_progress:
+        outcome = run.execute(on_progress, finish)
+    _summarise(console, request.out, metrics)
+    if outcome.interrupted:
+        console.print("Interrupted. The same command continues from here.")
+        return INTERRUPTED_EXIT_CODE
+    if outcome.exit_code == SourceTruncatedError.exit_code:
+        console.print(f"The input ended early: {metrics['truncated']}")
+    return outcome.exit_code
+
+
+def _claim_folder(out: Path, identity: str, *, fresh: bool) -> dict[str, Any] | None:
+    """Make the folder this run's; the metrics of the run where it is finished already.
+
+    Raises:
+        InputError: the folder cannot be written, is in use, or holds another run.
+    """
+    identity_file, metrics_file = out / _IDENTITY_FILE, out / results.METRICS_FILE
+    ledger = out / launch.LEDGER_FOLDER
+    try:
+        ledger.mkdir(parents=True, exist_ok=True)
+        with locked(ledger):
+            if fresh:
+                shutil.rmtree(ledger / "blobs", ignore_errors=True)
+                for path in [*ledger.glob("ledger.db*"), *(out / name for name in _FILES)]:
+                    path.unlink(missing_ok=True)
+            known = identity_file.read_text(encoding="utf-8") if identity_file.exists() else None
+            if known is not None and known != identity:
+                raise InputError(
+                    f"{out} holds a run of another source or configuration ({_difference(known, identity)}): "
+                    "choose another --out, or discard it with --fresh"
+                )
+            if known is None:
+                identity_file.write_text(identity, encoding="utf-8")
+            if not metrics_file.exists():
+                return None
+            metrics: dict[str, Any] = json.loads(metrics_file.read_text(encoding="utf-8"))
+            return metrics if metrics.get("is_complete") else None
+    except OSError as error:
+        raise InputError(f"cannot write to {out}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"{out} holds a damaged run ({error}): discard it with --fresh") from error
+
+
+def _difference(known: str, identity: str) -> str:
+    """Names of the parts in which two identities differ."""
+
+    def flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        if isinstance(value, dict):
+            for name, item in value.items():
+                yield from flat(item, f"{prefix}.{name}" if prefix else name)
+        else:
+            yield prefix, value
+
+    ours, theirs = dict(flat(json.loads(identity), "")), dict(flat(json.loads(known), ""))
+    names = sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
+    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
+
+
+def _write_results(
+    request: launch.RunRequest,
+    run: launch.LocalRun,
+    outcome: launch.RunOutcome,
+    bus: Bus,
+    reference: PoseTrack | list[PoseTrack] | None,
+) -> dict[str, Any]:
+    facts = results.RunFacts(
+        source=run.source_description,
+        exit_code=outcome.exit_code,
+        interrupted=outcome.interrupted,
+        wall_seconds=outcome.seconds,
+        start_up_seconds=outcome.start_up_seconds,
+        restart_count=outcome.restart_count,
+        first_frame=request.start,
+        stride=request.stride,
+        dead_jobs=tuple(JobClient(bus).reports(JobState.DEAD)) if outcome.state.dead_jobs else (),
+    )
+    load_blob = LedgerClient(bus).blob
+    return results.write_results(request.out, outcome.state, run.config, facts, load_blob, reference)
+
+
+@contextmanager
+def _display(console: Console, source: str) -> Iterator[Callable[[launch.Progress], None]]:
+    """A bar over the frames with what has come of them; plain lines where the output is no terminal."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[what]}"),
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+    )
+    last = {"text": ""}
+    console.print(source)
+    with bar:
+        task = bar.add_task("starting", total=None, what="")
+
+        def show(progress: launch.Progress) -> None:
+            state = _STATE_NAMES[progress.state] if progress.state is not None else ""
+            text = (
+                f"{progress.frames} frames, {progress.keyframes} keyframes, "
+                f"{progress.submaps}/{progress.segments} submaps, {progress.constraints} constraints, "
+                f"lag {progress.lag_submaps}"
+            )
+            if progress.dead_jobs:
+                text += f", {progress.dead_jobs} jobs given up"
+            bar.update(
+                task,
+                description=state or "running",
+                total=progress.segments * 2 or None if progress.is_input_complete else None,
+                completed=progress.submaps + progress.constraints,
+                what=text,
+            )
+            if not console.is_terminal and text != last["text"]:
+                console.print(text)
+                last["text"] = text
+
+        yield show
+
+
+def _summarise(console: Console, out: Path, metrics: dict[str, Any]) -> None:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    length = next(((name, value) for name, value in metrics.items() if name.startswith("path_length_")), None)
+    rows = [
+        ("frames", f"{metrics['frame_count']}, of them {metrics['keyframe_count']} keyframes"),
+        (
+            "submaps",
+            f"{metrics['submap_count']} of {metrics['segment_count']} ("
+            + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in metrics["submaps"].items())
+            + f"), {metrics['accepted_constraint_count']} constraints, {metrics['break_count']} breaks",
+        ),
+    ]
+    if length is not None:
+        rows.append(("path", f"{length[1]:.2f} {length[0].removeprefix('path_length_')}"))
+    if metrics.get("focal_over_width") is not None:
+        rows.append(("focal length", f"{metrics['focal_over_width']:.3f} image widths"))
+    truth = metrics.get("ground_truth")
+    if truth is not None and "not_evaluated" in truth:
+        rows.append(("ground truth", f"not compared: {truth['not_evaluated']}"))
+    elif truth is not None:
+        rows.append(
+            (
+                "ATE",
+                f"{truth['ate_rmse_m']:.3f} m RMSE over {truth['reference_length_m']:.1f} m "
+                f"({truth['evaluated_frame_count']} of {truth['reference_frame_count']} frames, Sim(3) aligned), "
+                f"drift {truth['drift_ate_percent']:.2f} %",
+            )
+        )
+    rows.append(("time", f"{metrics['wall_seconds']:.1f} s, of them {metrics['start_up_seconds']:.1f} s start-up"))
+    rows.append(("results", str(out)))
+    for name, value in rows:
+        table.add_row(name, value)
+    console.print(table)
+    for line in metrics["warnings"]:
+        console.print(f"warning: {line}", style="yellow")
