@@ -73,7 +73,7 @@ class TrajectoryQuery(BaseModel):
     responses=_TRAJECTORY_RESPONSES,
 )
 async def trajectory(results: TheResults, query: Annotated[TrajectoryQuery, Query()]) -> Response:
-    """Poses ``world_from_camera``, OpenCV axes, of the newest graph."""
+    """Poses that take points from the camera to the world, OpenCV axes, by the newest graph."""
     text = await results.text(query.format, query.frames, query.component)
     return Response(
         text.body,
@@ -97,7 +97,7 @@ async def trajectory(results: TheResults, query: Annotated[TrajectoryQuery, Quer
     },
 )
 async def map_ply(results: TheResults, _: Annotated[NoQuery, Query()]) -> Response:
-    """Confident points of all submaps, posed by the newest graph; made on demand and kept until the graph changes."""
+    """Confident points of the largest connected part, posed by the newest graph; made on demand and kept."""
     built = await results.map_ply()
     return Response(
         built.value,
