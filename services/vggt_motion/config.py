@@ -69,12 +69,14 @@ class FrontendConfig(Section):
         0.9, gt=0, le=1, description="tau_static: share of quasi-static pixels of a standing camera"
     )
     turning_score: Literal["yaw", "lateral"] = Field("yaw", description="signed common shift, or the paper's mean |fx|")
-    turning_flow_px: float = Field(1.4, gt=0, description="tau_turn for the chosen score")
+    turning_flow_px: float = Field(1.6, gt=0, description="tau_turn for the chosen score, per 0.1 s")
     smoothing_sigma_frames: float = Field(2.0, ge=0, description="Gaussian smoothing of the scores")
     smoothing_lookahead_frames: int = Field(4, ge=0, description="frames after the present one that smoothing may see")
     selection: Literal["dense", "uniform", "covisibility", "parallax"] = "parallax"
     static_pruning: bool = True
-    parallax_px: float = Field(15.0, gt=0, description="tau_palx: median flow since the last keyframe")
+    parallax_px: float = Field(
+        5.5, gt=0, description="tau_palx: shift since the last keyframe without its common part (frontend/keyframes.py)"
+    )
     uniform_stride: int = Field(3, ge=1, description="for selection = uniform")
     covisibility_ratio: float = Field(
         0.7, gt=0, lt=1, description="for selection = covisibility: below it a new keyframe"

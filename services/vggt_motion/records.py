@@ -71,7 +71,7 @@ class Keyframe:
     @property
     def keyframe_id(self) -> str:
         """``camera/epoch/frame index``, sortable as text within an epoch."""
-        return f"{self.camera}/{self.epoch}/{self.frame_index:08d}"
+        return keyframe_id(self.camera, self.epoch, self.frame_index)
 
 
 @dataclass(frozen=True)
@@ -468,6 +468,11 @@ class HealthReport:
     detail: str  # one line for a person
     resident_bytes: int
     counters: dict[str, float] = field(default_factory=dict)  # name with its unit -> value
+
+
+def keyframe_id(camera: str, epoch: int, frame_index: int) -> str:
+    """Id of a keyframe and its record."""
+    return f"{camera}/{epoch}/{frame_index:08d}"
 
 
 def segment_id(index: int) -> str:
