@@ -1,4 +1,4 @@
-"""Real processes for the tests of the bus: run as ``python bus_processes.py ROLE ENDPOINT ...``; and what starts them."""
+"""Real processes for the tests of the bus: run as ``python bus_processes.py ROLE ENDPOINT ...``."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Follower(Generic[FollowedRecord]):
         self._skipped_count = 0
         self._failure: VggtMotionError | None = None
         self._is_closed = False
-        self._subscription = bus.subscribe(bus.keys.log(self._stream), self._on_sample, history=True)
+        self._subscription = bus.subscribe(bus.keys.log(self._stream), self._on_sample)
         self._thread = threading.Thread(target=self._run, name=f"follow {stream}", daemon=True)
         self._thread.start()
 

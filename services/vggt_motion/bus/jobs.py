@@ -173,7 +173,7 @@ def many_lines(text: str) -> str:
 
 
 def _batches(jobs: Sequence[Job]) -> list[list[Job]]:
-    batches: list[list[Job]] = [[]]
+    batches: list[list[Job]] = [[]] if jobs else []
     size = 0
     for job in jobs:
         if size + len(job.payload) > _JOBS_PER_SUBMIT_BYTES and batches[-1]:

@@ -112,6 +112,8 @@ class LedgerClient:
             patience_s=patience_s,
             what=f"read {stream}",
         )
+        if limit and len(reply.entries) > limit:
+            raise CodecError(f"read {stream}: {len(reply.entries)} entries came where {limit} were asked for")
         for offset, entry in enumerate(reply.entries):
             if entry.sequence != from_sequence + offset or entry.stream != stream:
                 raise CodecError(

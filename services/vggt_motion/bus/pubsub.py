@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import timedelta
 from typing import Any, Protocol
 
 import zenoh
@@ -16,7 +17,8 @@ from vggt_motion.errors import BusError, BusUnavailableError
 _log = logging.getLogger(__name__)
 _FIFO_CAPACITY = 8  # the default of 256 messages would be a gigabyte of images
 _LATEST_CAPACITY = 1
-_HEARTBEAT_S = 0.5
+# Recovery asks the publishers; their heartbeats alone bring nothing back after a restart of the router (Zenoh 1.10).
+_RECOVERY_INTERVAL = timedelta(seconds=1)
 _JOIN_S = 1.0
 _NS_PER_S = 1_000_000_000
 MAX_PAYLOAD_BYTES = 768 * 2**20  # Zenoh drops what exceeds 1 GiB without a word
@@ -59,7 +61,7 @@ class Publisher:
                 congestion_control=congestion,
                 reliability=zenoh.Reliability.RELIABLE,
                 cache=ext.CacheConfig(history),
-                sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
         else:
@@ -122,7 +124,7 @@ class Subscription:
                 key,
                 channel,
                 history=ext.HistoryConfig(detect_late_publishers=True),
-                recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                recovery=ext.RecoveryConfig(periodic_queries=_RECOVERY_INTERVAL, heartbeat=None),
             )
         else:
             self._subscriber = session.declare_subscriber(key, channel)

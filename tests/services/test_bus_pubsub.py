@@ -1,0 +1,171 @@
+"""Publishing and subscribing over a real router: history, recovery, order; a slow subscriber harms only itself."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from bus_processes import connect, free_port, running, wait_until
+from vggt_motion.bus.pubsub import Publisher
+from vggt_motion.bus.session import Bus, Sample
+
+
+class Collector:
+    def __init__(self, delay_s: float = 0.0) -> None:
+        self.samples: list[Sample] = []
+        self.delay_s = delay_s
+
+    def __call__(self, sample: Sample) -> None:
+        time.sleep(self.delay_s)
+        self.samples.append(sample)
+
+    def numbers(self) -> list[int]:
+        return [int(sample.payload.split(b":")[0]) for sample in self.samples]
+
+
+def publish_until_heard(publish: Callable[[], None], collector: Collector) -> None:
+    """A subscription takes a moment to reach the publisher."""
+
+    def heard() -> bool:
+        publish()
+        return bool(collector.samples)
+
+    wait_until(heard)
+
+
+def put(publisher: Publisher, number: int, size: int = 0) -> None:
+    publisher.put(f"{number}:".encode() + bytes(size))
+
+
+def put_all(publisher: Publisher, numbers: Iterable[int], size: int) -> None:
+    for number in numbers:
+        put(publisher, number, size)
+
+
+def test_a_sample_carries_payload_time_attachment_and_encoding(endpoint: str) -> None:
+    with connect(endpoint) as sender, connect(endpoint) as receiver:
+        got = Collector()
+        receiver.subscribe(receiver.keys.all_images(), got)
+        publisher = sender.publisher(sender.keys.image("front"), blocking=True, encoding="application/protobuf;a.B")
+        moment = 1_700_000_000_123_456_789
+        publish_until_heard(lambda: publisher.put(b"frame", timestamp_ns=moment, attachment=b"head"), got)
+        first = got.samples[0]
+        assert (first.payload, first.attachment) == (b"frame", b"head")
+        assert (first.key, first.encoding) == (sender.keys.image("front"), "application/protobuf;a.B")
+        assert first.timestamp_ns is not None and abs(first.timestamp_ns - moment) <= 2
+
+
+def test_a_late_subscriber_gets_the_history_in_order(endpoint: str) -> None:
+    with connect(endpoint) as sender, connect(endpoint) as receiver:
+        publisher = sender.publisher(sender.keys.log("event"), blocking=True, history=8)
+        for number in range(20):
+            put(publisher, number)
+        got = Collector()
+        receiver.subscribe(receiver.keys.log("event"), got, history=True)
+        wait_until(lambda: len(got.samples) >= 8)
+        put(publisher, 20)
+        wait_until(lambda: 20 in got.numbers())
+        assert got.numbers() == list(range(12, 21))
+
+
+def test_nothing_is_lost_while_the_router_is_away(tmp_path: Path) -> None:
+    address = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        running(tmp_path, "router", address) as router,
+        connect(address) as sender,
+        connect(address) as receiver,
+    ):
+        got = Collector()
+        receiver.subscribe(receiver.keys.log("event"), got, history=True)
+        publisher = sender.publisher(sender.keys.log("event"), blocking=True, history=64)
+        wait_until(lambda: receiver.is_connected and sender.is_connected)
+        for number in range(10):
+            put(publisher, number)
+        wait_until(lambda: len(got.samples) == 10)
+        router.kill()
+        for number in range(10, 30):
+            put(publisher, number)
+            time.sleep(0.02)
+        with running(tmp_path, "router", address):
+            for number in range(30, 40):
+                put(publisher, number)
+                time.sleep(0.02)
+            wait_until(lambda: len(got.samples) >= 40)
+            assert got.numbers() == list(range(40))
+
+
+def test_a_slow_live_subscriber_sees_the_newest_and_holds_up_nobody(endpoint: str) -> None:
+    with connect(endpoint) as sender, connect(endpoint) as receiver:
+        receiver.serve(receiver.keys.rpc("test", "echo"), lambda _, payload: payload)
+        slow = Collector(delay_s=0.2)
+        receiver.subscribe(receiver.keys.all_images(), slow, latest_only=True)
+        publisher = sender.publisher(sender.keys.image("front"), blocking=False)
+        publish_until_heard(lambda: put(publisher, 0), slow)
+        slow.samples.clear()
+        for number in range(1, 101):
+            put(publisher, number, size=100_000)
+            time.sleep(0.005)
+        assert sender.request(sender.keys.rpc("test", "echo"), b"x", timeout_s=5.0) == b"x"
+        wait_until(lambda: 100 in slow.numbers())
+        assert len(slow.samples) < 50
+        assert slow.numbers() == sorted(slow.numbers())
+
+
+def test_a_slow_blocking_subscriber_with_a_link_of_its_own_gets_all_and_holds_up_no_request(endpoint: str) -> None:
+    count = 60
+    with connect(endpoint) as sender, connect(endpoint) as receiver, connect(endpoint) as third:
+        third.serve(third.keys.rpc("test", "echo"), lambda _, payload: payload)
+        slow = Collector(delay_s=0.02)
+        receiver.subscribe(receiver.keys.all_images(), slow, isolated=True)
+        publisher = sender.publisher(sender.keys.image("front"), blocking=True)
+        publish_until_heard(lambda: put(publisher, 0), slow)
+        wait_until(lambda: len(slow.samples) == slow.numbers().count(0) and _settled(slow))
+        slow.samples.clear()
+        sending = threading.Thread(target=put_all, args=(publisher, range(1, count + 1), 1_000_000))
+        sending.start()
+        for _ in range(10):
+            assert receiver.request(receiver.keys.rpc("test", "echo"), b"x", timeout_s=5.0) == b"x"
+        sending.join(60)
+        wait_until(lambda: len(slow.samples) >= count)
+        assert slow.numbers() == list(range(1, count + 1))
+
+
+def _settled(collector: Collector) -> bool:
+    before = len(collector.samples)
+    time.sleep(0.2)
+    return len(collector.samples) == before
+
+
+def test_a_callback_that_raises_does_not_end_the_subscription(endpoint: str) -> None:
+    with connect(endpoint) as sender, connect(endpoint) as receiver:
+        got = Collector()
+
+        def callback(sample: Sample) -> None:
+            if sample.payload.startswith(b"1:"):
+                raise ValueError("a defect of the subscriber")
+            got(sample)
+
+        receiver.subscribe(receiver.keys.log("event"), callback, history=True)
+        publisher = sender.publisher(sender.keys.log("event"), blocking=True, history=8)
+        for number in range(4):
+            put(publisher, number)
+        wait_until(lambda: 3 in got.numbers())
+        assert got.numbers() == [0, 2, 3]
+
+
+def test_a_closed_subscription_is_silent_and_closing_twice_is_fine(endpoint: str, bus: Bus) -> None:
+    with connect(endpoint) as sender:
+        got = Collector()
+        subscription = bus.subscribe(bus.keys.all_images(), got)
+        publisher = sender.publisher(sender.keys.image("front"), blocking=True)
+        publish_until_heard(lambda: put(publisher, 0), got)
+        subscription.close()
+        subscription.close()
+        count = len(got.samples)
+        put(publisher, 1)
+        time.sleep(0.3)
+        assert len(got.samples) == count
+        publisher.close()
+        publisher.close()

@@ -1,0 +1,233 @@
+"""Requests over a real router: answers, refusals, silence, many at once, and stopping."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from bus_processes import bus_config, connect, free_port, running, wait_until
+from vggt_motion.bus.session import Bus, EndpointTakenError, open_bus, zenoh_config
+from vggt_motion.errors import (
+    BusError,
+    BusUnavailableError,
+    ConfigurationError,
+    DiskFullError,
+    RefusalCode,
+    RequestRefusedError,
+)
+
+
+def echo_when_ready(bus: Bus, payload: bytes = b"") -> bytes:
+    answers: list[bytes] = []
+
+    def ask() -> bool:
+        try:
+            answers.append(bus.request(bus.keys.rpc("test", "echo"), payload))
+        except BusUnavailableError:
+            return False
+        return True
+
+    wait_until(ask)
+    return answers[0]
+
+
+def test_answers_and_refusals_come_back_as_what_they_are(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+    with running(tmp_path, "answer", endpoint):
+        assert echo_when_ready(bus) == b""
+        for payload in (b"x", bytes(range(256)) * 4000, bytes(20_000_000)):
+            assert bus.request(bus.keys.rpc("test", "echo"), payload) == payload
+        with pytest.raises(RequestRefusedError, match="known with another content") as refused:
+            bus.request(bus.keys.rpc("test", "conflict"), b"")
+        assert refused.value.code is RefusalCode.CONFLICT
+        with pytest.raises(DiskFullError, match="12 MB are left, the reserve is 256 MB"):
+            bus.request(bus.keys.rpc("test", "full"), b"")
+        with pytest.raises(RequestRefusedError, match=r"^internal error: ZeroDivisionError$") as defect:
+            bus.request(bus.keys.rpc("test", "defect"), b"")
+        assert defect.value.code is RefusalCode.INTERNAL
+        assert bus.request(bus.keys.rpc("test", "echo"), b"still here") == b"still here"
+
+
+def test_no_reply_is_a_failure(bus: Bus) -> None:
+    with pytest.raises(BusUnavailableError, match="nobody answers"):
+        bus.request(bus.keys.rpc("test", "nothing"), b"")
+
+
+def test_a_slow_answer_times_out(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+    with running(tmp_path, "answer", endpoint):
+        echo_when_ready(bus)
+        with pytest.raises(BusUnavailableError, match=r"no answer within 0\.3 s"):
+            bus.request(bus.keys.rpc("test", "slow"), b"", timeout_s=0.3)
+
+
+def test_an_answerer_that_is_killed_ends_the_request(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+    with running(tmp_path, "answer", endpoint) as answerer:
+        echo_when_ready(bus)
+        timer = threading.Timer(0.3, answerer.kill)
+        timer.start()
+        with pytest.raises(BusUnavailableError, match="nobody answers"):
+            bus.request(bus.keys.rpc("test", "slow"), b"", timeout_s=60.0)
+        timer.join()
+
+
+def test_waiting_requests_do_not_hold_up_others(endpoint: str) -> None:
+    release = threading.Event()
+    with connect(endpoint) as server, connect(endpoint) as client:
+        server.serve(server.keys.rpc("test", "wait"), lambda *_: b"late" if release.wait(30) else b"", threads=32)
+        server.serve(server.keys.rpc("test", "echo"), lambda _, payload: payload)
+        with ThreadPoolExecutor(32) as pool:
+            waiting = [pool.submit(client.request, client.keys.rpc("test", "wait"), b"") for _ in range(32)]
+            time.sleep(0.3)
+            assert client.request(client.keys.rpc("test", "echo"), b"now") == b"now"
+            assert not any(future.done() for future in waiting)
+            release.set()
+            assert [future.result(30) for future in waiting] == [b"late"] * 32
+
+
+def test_more_requests_than_threads_are_all_answered_each_once(endpoint: str) -> None:
+    seen: list[bytes] = []
+    with connect(endpoint) as server, connect(endpoint) as client:
+
+        def handler(_: str, payload: bytes) -> bytes:
+            time.sleep(0.002)
+            seen.append(payload)
+            return payload
+
+        server.serve(server.keys.rpc("test", "echo"), handler, threads=3)
+        payloads = [f"{number}".encode() * 1000 for number in range(300)]
+        with ThreadPoolExecutor(64) as pool:
+            answers = list(pool.map(lambda payload: client.request(client.keys.rpc("test", "echo"), payload), payloads))
+    assert answers == payloads
+    assert sorted(seen) == sorted(payloads)
+
+
+def test_handlers_run_in_at_most_so_many_threads_and_never_in_zenohs(endpoint: str) -> None:
+    names: set[str] = set()
+    with connect(endpoint) as server, connect(endpoint) as client:
+
+        def handler(_: str, payload: bytes) -> bytes:
+            names.add(f"{threading.current_thread().name} {threading.get_ident()}")
+            time.sleep(0.01)
+            return payload
+
+        key = server.keys.rpc("test", "echo")
+        server.serve(key, handler, threads=4)
+        with ThreadPoolExecutor(16) as pool:
+            list(pool.map(lambda _: client.request(key, b""), range(64)))
+    assert len(names) == 4 and all(name.startswith("serve ") for name in names)
+
+
+def test_a_wildcard_request_is_refused(endpoint: str) -> None:
+    with connect(endpoint) as server, connect(endpoint) as client:
+        server.serve(server.keys.all_blobs(), lambda *_: b"content")
+        assert client.request(client.keys.blob("ab" * 32), b"") == b"content"
+        with pytest.raises(RequestRefusedError, match="without wildcards"):
+            client.request(client.keys.all_blobs(), b"")
+
+
+def test_closing_a_server_refuses_what_waits_and_frees_the_key(endpoint: str) -> None:
+    release = threading.Event()
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "wait")
+        served = server.serve(key, lambda *_: b"first" if release.wait(30) else b"")
+        with ThreadPoolExecutor(2) as pool:
+            first, second = (pool.submit(client.request, key, b"") for _ in range(2))
+            time.sleep(0.3)
+            threading.Timer(0.2, release.set).start()
+            served.close()
+            outcomes = [future.exception(30) or future.result() for future in (first, second)]
+        assert b"first" in outcomes
+        assert any(isinstance(outcome, BusUnavailableError) and "stopping" in str(outcome) for outcome in outcomes)
+        with pytest.raises(BusUnavailableError, match="nobody answers"):
+            client.request(key, b"")
+        server.serve(key, lambda *_: b"second")
+        assert client.request(key, b"") == b"second"
+
+
+def test_interrupt_ends_requests_under_way_and_refuses_new_ones(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+    with running(tmp_path, "answer", endpoint):
+        echo_when_ready(bus)
+        with ThreadPoolExecutor(4) as pool:
+            pending = [pool.submit(bus.request, bus.keys.rpc("test", "slow"), b"", timeout_s=60.0) for _ in range(4)]
+            time.sleep(0.3)
+            bus.interrupt()
+            for future in pending:
+                with pytest.raises(BusUnavailableError, match="stopping"):
+                    future.result(10)
+        with pytest.raises(BusUnavailableError, match="stopping"):
+            bus.request(bus.keys.rpc("test", "echo"), b"")
+
+
+def test_requests_work_again_after_the_router_was_replaced(tmp_path: Path) -> None:
+    address = f"tcp/127.0.0.1:{free_port()}"
+    with running(tmp_path, "router", address) as first, connect(address) as bus, running(tmp_path, "answer", address):
+        assert echo_when_ready(bus, b"before") == b"before"
+        assert bus.is_connected
+        first.kill()
+        wait_until(lambda: not bus.is_connected)
+        with pytest.raises(BusUnavailableError):
+            bus.request(bus.keys.rpc("test", "echo"), b"")
+        time.sleep(1.5)  # longer than one attempt to connect
+        with running(tmp_path, "router", address):
+            assert echo_when_ready(bus, b"after") == b"after"
+
+
+def test_no_router_is_one_clear_line(tmp_path: Path) -> None:
+    address = f"tcp/127.0.0.1:{free_port()}"
+    with pytest.raises(BusUnavailableError, match=rf"^no router at {address} within 1\.5 s$"):
+        open_bus(bus_config(address, connect_timeout_s=1.5))
+
+
+def test_waiting_for_a_router_can_be_stopped() -> None:
+    stopping = threading.Event()
+    threading.Timer(0.3, stopping.set).start()
+    begin = time.monotonic()
+    with pytest.raises(BusUnavailableError, match="stopped while waiting"):
+        open_bus(bus_config(f"tcp/127.0.0.1:{free_port()}", connect_timeout_s=60.0), stopping=stopping)
+    assert time.monotonic() - begin < 30.0
+
+
+@pytest.mark.parametrize("address", ["nonsense", "tcp/", "tcp/nowhere", "carrier-pigeon/127.0.0.1:1"])
+def test_an_endpoint_that_makes_no_sense_is_a_configuration_error(address: str) -> None:
+    with pytest.raises((ConfigurationError, BusUnavailableError)) as problem:
+        open_bus(bus_config(address, connect_timeout_s=0.5))
+    assert address in str(problem.value)
+    assert "\n" not in str(problem.value)
+
+
+def test_a_taken_endpoint_is_one_clear_line(endpoint: str, bus: Bus) -> None:
+    with pytest.raises(EndpointTakenError, match=rf"^endpoint {endpoint} is already in use$"):
+        open_bus(bus_config(endpoint), mode="router")
+
+
+def test_our_settings_win_over_the_users_file(tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(
+        '{mode: "peer", scouting: {multicast: {enabled: true}}, '
+        'transport: {auth: {usrpwd: {user: "u", password: "p"}}}}'
+    )
+    config = bus_config("tcp/127.0.0.1:7447").model_copy(update={"zenoh_config": file})
+    merged = zenoh_config(config)
+    assert isinstance(merged, zenoh.Config)
+    assert merged.get_json("mode") == '"client"'
+    assert merged.get_json("scouting/multicast/enabled") == "false"
+    assert merged.get_json("scouting/gossip/enabled") == "false"
+    assert merged.get_json("transport/shared_memory/enabled") == "false"
+    assert merged.get_json("transport/link/tx/lease") == "3000"
+    assert merged.get_json("transport/auth/usrpwd/user") == '"u"'
+    file.write_text("{no json5")
+    with pytest.raises(ConfigurationError, match=r"zenoh\.json5: not accepted by Zenoh"):
+        zenoh_config(config)
+
+
+def test_a_message_that_zenoh_would_drop_without_a_word_is_refused(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vggt_motion.bus.session.MAX_PAYLOAD_BYTES", 1000)
+    monkeypatch.setattr("vggt_motion.bus.pubsub.MAX_PAYLOAD_BYTES", 1000)
+    with pytest.raises(BusError, match="1001 bytes is longer than the bus carries"):
+        bus.request(bus.keys.rpc("test", "echo"), bytes(1001))
+    with pytest.raises(BusError, match="1001 bytes is longer than the bus carries"):
+        bus.publisher(bus.keys.image("front"), blocking=False).put(bytes(1001))
