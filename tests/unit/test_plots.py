@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vggt_motion.evaluation import plots, render
+from vggt_motion.evaluation import map_plots, plots, render
+from vggt_motion.evaluation.plot_style import to_png, to_svg
 from vggt_motion.evaluation.report_data import CameraView, ComponentTrack, GroundTruth, PointCloud
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics
@@ -112,18 +113,18 @@ def test_trajectory_puts_a_long_drive_ahead_along_the_paper() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_hardly_any_pose_is_drawn_without_error(count: int) -> None:
     frames = one_part(straight(count))
-    plots.to_svg(plots.trajectory_figure(frames, frames, "units"))
-    plots.to_svg(plots.motion_figure(segments_of("L" * max(count, 1)), frames, None, "units"))
+    to_svg(plots.trajectory_figure(frames, frames, "units"))
+    to_svg(plots.motion_figure(segments_of("L" * max(count, 1)), frames, None, "units"))
     if count:
-        plots.to_svg(plots.overlay_figure(frames, GroundTruth(straight(count), {0: Sim3.identity()})))
+        to_svg(plots.overlay_figure(frames, GroundTruth(straight(count), {0: Sim3.identity()})))
 
 
 def test_camera_that_did_not_move_is_drawn_without_error() -> None:
     frames = one_part(straight(12, step=0.0))
-    plots.to_svg(plots.trajectory_figure(frames, frames, "units"))
-    plots.to_svg(plots.motion_figure(segments_of("S" * 12), frames, None, "units"))
+    to_svg(plots.trajectory_figure(frames, frames, "units"))
+    to_svg(plots.motion_figure(segments_of("S" * 12), frames, None, "units"))
     cloud = PointCloud(np.zeros((5, 3)), np.zeros((5, 3), np.uint8))
-    plots.to_png(plots.map_figure(cloud, frames, "units"), 50)
+    to_png(map_plots.map_figure(cloud, frames, "units"), 50)
 
 
 def test_poses_that_are_not_finite_are_left_out() -> None:
@@ -187,11 +188,11 @@ def test_edges_tell_refused_from_accepted_and_leave_the_scale_of_refused_ones_ou
 def test_constraints_without_numbers_are_drawn_without_error() -> None:
     lost = constraint(1, accepted=False)
     lost = Constraint(lost.spec, False, "no points", Sim3(), float("nan"), float("nan"), np.eye(7), 0)
-    plots.to_svg(plots.edges_figure([lost], None))
+    to_svg(plots.edges_figure([lost], None))
 
 
 def test_names_from_outside_are_not_read_as_mathematics() -> None:
-    svg = plots.to_svg(plots.stages_figure({r"$\frac{": 1.0, "<b>&": 2.0}))
+    svg = to_svg(plots.stages_figure({r"$\frac{": 1.0, "<b>&": 2.0}))
     assert svg.startswith(b"<?xml")
 
 
@@ -199,7 +200,7 @@ def test_files_of_the_same_figure_are_the_same_bytes() -> None:
     def make() -> tuple[bytes, bytes]:
         frames = one_part(straight(20))
         figure = plots.trajectory_figure(frames, frames, "m")
-        return plots.to_svg(figure), plots.to_png(figure, 60)
+        return to_svg(figure), to_png(figure, 60)
 
     assert make() == make()
 
@@ -286,7 +287,7 @@ def test_map_is_cropped_to_the_drive_and_not_to_the_horizon() -> None:
     far = rng.normal(0.0, 5000.0, (400, 3))
     points = np.concatenate([near, far])
     cloud = PointCloud(points, np.full(points.shape, 180, np.uint8))
-    axes = plots.map_figure(cloud, one_part(straight(51)), "m").axes[0]
+    axes = map_plots.map_figure(cloud, one_part(straight(51)), "m").axes[0]
     left, right = sorted(axes.get_xlim())
     assert -20.0 < left <= 0.0 and 50.0 <= right < 70.0
 
@@ -295,7 +296,7 @@ def test_camera_view_figure_sets_the_recorded_frame_beside_the_map() -> None:
     cloud = PointCloud(np.array([[0.0, 0.0, 5.0]]), np.array([[255, 0, 0]], np.uint8))
     recorded = np.full((94, 310, 3), 77, np.uint8)
     view = CameraView(12, np.eye(4), Intrinsics.centred(300.0, 310, 94), recorded)
-    first, second = plots.camera_view_figure(cloud, view).axes
+    first, second = map_plots.camera_view_figure(cloud, view).axes
     assert first.get_title(loc="left") == "recorded frame 12"
     np.testing.assert_array_equal(first.images[0].get_array(), recorded)
     drawn = np.argwhere((np.asarray(second.images[0].get_array()) == (255, 0, 0)).all(axis=2))

@@ -1,127 +1,54 @@
-"""The plots of the report, one function each, as Matplotlib figures that no window is opened for.
-
-Colours are those of Okabe and Ito, which colour-blind readers tell apart; nothing is told by colour alone. Text that
-came from outside is never read as mathematics.
-"""
+"""The plots of the report about the trajectory and the run, one function each."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from vggt_motion.evaluation import render
-from vggt_motion.evaluation.report_data import CameraView, ComponentTrack, GroundTruth, MotionScores, PointCloud
+from vggt_motion.evaluation.plot_style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PART_COLORS,
+    PURPLE,
+    SKY,
+    VERMILION,
+    WIDTH_IN,
+    YELLOW,
+    Plan,
+    finite,
+    legend_above,
+    mark_ends,
+    panel_inches,
+    styled,
+    to_png,
+)
+from vggt_motion.evaluation.report_data import ComponentTrack, GroundTruth, MotionScores
 from vggt_motion.geometry.track import PoseTrack
 from vggt_motion.records import Constraint, ConstraintKind, MotionState, Segment, SubmapGeometry
 
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-    "#F0E442",
-)
-INK, MUTED, GRID = "#1b1f24", "#6a737d", "#e3e6ea"
-PART_COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 STATE_COLORS = {MotionState.STATIC: "#8c959f", MotionState.TURNING: ORANGE, MotionState.LINEAR: SKY}
 STATE_NAMES = {MotionState.STATIC: "standing", MotionState.TURNING: "turning", MotionState.LINEAR: "straight"}
 
 _MAX_DRAWN_POSES = 6000  # more is finer than the picture and makes the file heavy
 _MAX_PANELS = 6
-_WIDTH_IN = 9.6
-
-_STYLE: dict[Any, Any] = {
-    "font.size": 10.5,
-    "font.family": "sans-serif",
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "axes.titlesize": 11.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "legend.frameon": True,
-    "legend.framealpha": 0.9,
-    "legend.edgecolor": GRID,
-    "legend.fontsize": 9.5,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "vggt_motion",  # without it the identifiers in the file differ from run to run
-    "figure.facecolor": "white",
-    "text.parse_math": False,
-}
 
 
-@contextmanager
-def _style() -> Iterator[None]:
-    """Our look, for whatever builds or writes a figure."""
-    with matplotlib.rc_context(_STYLE):
-        yield
-
-
-@_style()
-def to_svg(figure: Figure) -> bytes:
-    """The figure as an SVG file, the same bytes for the same figure."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
-
-
-@_style()
-def to_png(figure: Figure, dots_per_inch: int = 160) -> bytes:
-    """The figure as a PNG file."""
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png", dpi=dots_per_inch, metadata={"Software": None})
-    return buffer.getvalue()
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """Which world axes lie on the paper: x right and z up or, for a drive much longer ahead, z right and x down."""
-
-    is_turned: bool
-
-    def horizontal(self, positions: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        return positions[:, 2] if self.is_turned else positions[:, 0]
-
-    def vertical(self, positions: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        return positions[:, 0] if self.is_turned else positions[:, 2]
-
-    def label(self, axes: Any, unit: str, horizontal: bool = True) -> None:
-        ahead, right = f"ahead of the first camera, z ({unit})", f"to the right, x ({unit})"
-        if horizontal:
-            axes.set_xlabel(ahead if self.is_turned else right)
-        axes.set_ylabel(right if self.is_turned else ahead)
-
-
-def _plan_of(positions: npt.NDArray[np.floating]) -> _Plan:
+def _plan_of(positions: npt.NDArray[np.floating]) -> Plan:
     span = np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
-    return _Plan(is_turned=bool(span[2] > 1.3 * span[0]))
+    return Plan(is_turned=bool(span[2] > 1.3 * span[0]))
 
 
 def _frame_axes(
-    axes: Any, plan: _Plan, positions: npt.NDArray[np.floating], min_ratio: float, shape: float | None = None
+    axes: Any, plan: Plan, positions: npt.NDArray[np.floating], min_ratio: float, shape: float | None = None
 ) -> float:
     """Set equal, padded limits around positions (N, 3); returns height over width, ``shape`` where one is given."""
     h, v = plan.horizontal(positions), plan.vertical(positions)
@@ -143,18 +70,6 @@ def _thinned(track: PoseTrack) -> PoseTrack:
     return track.subset(np.unique(np.linspace(0, len(track) - 1, _MAX_DRAWN_POSES).round().astype(np.int64)))
 
 
-def _mark_ends(axes: Any, plan: _Plan, positions: npt.NDArray[np.floating], is_labelled: bool) -> None:
-    h, v = plan.horizontal(positions), plan.vertical(positions)
-    axes.plot(h[0], v[0], "o", ms=9, mfc="white", mec=INK, mew=1.8, zorder=6, label="start" if is_labelled else None)
-    axes.plot(h[-1], v[-1], "s", ms=8, mfc=INK, mec="white", mew=1.2, zorder=6, label="end" if is_labelled else None)
-
-
-def _legend_above(axes: Any) -> None:
-    axes.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, frameon=False, borderaxespad=0.1, handlelength=1.4
-    )
-
-
 def _head_room(values: npt.ArrayLike) -> float:
     """Upper end of an axis that starts at 0."""
     array = np.asarray(values, np.float64)
@@ -162,18 +77,10 @@ def _head_room(values: npt.ArrayLike) -> float:
     return 1.12 * float(array.max()) if len(array) and array.max() > 0.0 else 1.0
 
 
-def _finite(track: PoseTrack) -> PoseTrack:
-    return track.subset(np.flatnonzero(np.isfinite(track.world_from_camera).all(axis=(1, 2))))
-
-
-def _panel_inches(ratio: float, width: float, lowest: float = 1.7, highest: float = 7.2) -> float:
-    return float(np.clip(ratio * width, lowest, highest))
-
-
-@_style()
+@styled()
 def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_unit: str) -> Figure:
     """The trajectory from above: a line through all frames, a dot per keyframe; a panel for each unconnected part."""
-    whole = [(component, _finite(track)) for component, track in frames.parts()]
+    whole = [(component, finite(track)) for component, track in frames.parts()]
     parts = sorted((part for part in whole if len(part[1])), key=lambda part: -len(part[1]))[:_MAX_PANELS]
     parts.sort(key=lambda part: part[0])
     dots = dict(keyframes.parts())
@@ -181,7 +88,7 @@ def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_
     columns = min(len(parts), 2) if len(parts) > 1 else 1
     rows = -(-len(parts) // columns) if parts else 1
     grid = figure.subplots(rows, columns, squeeze=False)
-    width = (_WIDTH_IN - 0.8) / columns
+    width = (WIDTH_IN - 0.8) / columns
     heights = [1.7]
     for place, axes in enumerate(grid.flat):
         if place >= len(parts):
@@ -189,25 +96,25 @@ def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_
             continue
         component, track = parts[place]
         count, positions = len(track), _thinned(track).positions
-        plan = _plan_of(positions) if len(parts) == 1 else _Plan(is_turned=False)
+        plan = _plan_of(positions) if len(parts) == 1 else Plan(is_turned=False)
         color = PART_COLORS[place % len(PART_COLORS)]
         axes.plot(plan.horizontal(positions), plan.vertical(positions), "-", color=color, lw=2, label="all frames")
         if component in dots:
-            at = _thinned(_finite(dots[component])).positions
+            at = _thinned(finite(dots[component])).positions
             axes.plot(
                 plan.horizontal(at), plan.vertical(at), ".", color=color, ms=7, mec="white", mew=0.5, label="keyframes"
             )
-        _mark_ends(axes, plan, positions, is_labelled=True)
+        mark_ends(axes, plan, positions, is_labelled=True)
         shape = None if len(parts) == 1 else 0.75  # panels of one size, however the parts are shaped
-        heights.append(_panel_inches(_frame_axes(axes, plan, positions, 0.12, shape), width))
+        heights.append(panel_inches(_frame_axes(axes, plan, positions, 0.12, shape), width))
         plan.label(axes, length_unit)
         if len(parts) > 1:
             axes.set_title(f"part from submap {component} ({count} frames)")
             if place == 0:
                 axes.legend(loc="best", ncols=2)
         else:
-            _legend_above(axes)
-    figure.set_size_inches(_WIDTH_IN, rows * (max(heights) + 0.75))
+            legend_above(axes)
+    figure.set_size_inches(WIDTH_IN, rows * (max(heights) + 0.75))
     return figure
 
 
@@ -216,7 +123,7 @@ def _aligned(frames: ComponentTrack, truth: GroundTruth) -> list[tuple[int, Pose
     out = []
     for component, track in frames.parts():
         alignment = truth.truth_from_component.get(component)
-        track = _finite(track)
+        track = finite(track)
         if alignment is None or not len(track):
             continue
         moved = np.array([alignment.act_pose(pose) for pose in track.world_from_camera])
@@ -238,21 +145,21 @@ def _position_errors(estimate: PoseTrack, truth: PoseTrack) -> tuple[npt.NDArray
     return travelled[place][matched], error[matched]
 
 
-@_style()
+@styled()
 def overlay_figure(frames: ComponentTrack, truth: GroundTruth) -> Figure:
     """The aligned trajectory over the ground truth from above, and its position error along the way."""
-    reference = _thinned(_finite(truth.track))
+    reference = _thinned(finite(truth.track))
     parts = _aligned(frames, truth)
     everything = np.concatenate([reference.positions, *(track.positions for _, track in parts)])
     figure = Figure(layout="constrained")
     plan = _plan_of(everything)
     span = np.maximum(np.ptp(everything, axis=0), 1e-6)
     long, short = (span[2], span[0]) if plan.is_turned else (span[0], span[2])
-    tall = _panel_inches(
-        (max(short, 0.12 * max(long, short)) + 0.08 * long) / (1.08 * max(long, 0.12 * short)), _WIDTH_IN - 0.9
+    tall = panel_inches(
+        (max(short, 0.12 * max(long, short)) + 0.08 * long) / (1.08 * max(long, 0.12 * short)), WIDTH_IN - 0.9
     )
     above, below = figure.subplots(2, 1, height_ratios=[tall, 1.9])
-    figure.set_size_inches(_WIDTH_IN, tall + 1.9 + 1.4)
+    figure.set_size_inches(WIDTH_IN, tall + 1.9 + 1.4)
     h, v = plan.horizontal(reference.positions), plan.vertical(reference.positions)
     above.plot(h, v, "-", color=INK, lw=4.5, alpha=0.28, solid_capstyle="round", label="ground truth")
     largest: list[float] = []
@@ -285,10 +192,10 @@ def overlay_figure(frames: ComponentTrack, truth: GroundTruth) -> Figure:
                 fontsize=9.5,
                 bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 1.0},
             )
-    _mark_ends(above, plan, reference.positions, is_labelled=True)
+    mark_ends(above, plan, reference.positions, is_labelled=True)
     _frame_axes(above, plan, everything, 0.12)
     plan.label(above, "m")
-    _legend_above(above)
+    legend_above(above)
     below.set_xlabel("distance travelled (m)")
     below.set_ylabel("position error (m)")
     below.set_ylim(0.0, _head_room(largest))
@@ -337,14 +244,14 @@ def _rates(frames: ComponentTrack) -> tuple[npt.NDArray[np.int64], npt.NDArray[n
     return (track.times_ns[:-1] + np.diff(track.times_ns) // 2), speed, yaw
 
 
-@_style()
+@styled()
 def motion_figure(
     segments: Sequence[Segment], frames: ComponentTrack, scores: MotionScores | None, length_unit: str
 ) -> Figure:
     """Motion states, keyframes and submap borders over time, above what the trajectory says about speed and turning."""
     runs = _state_runs(segments)
     row_names = ["speed", "yaw"] + (["static", "turning"] if scores is not None else [])
-    figure = Figure(figsize=(_WIDTH_IN, 1.15 + 1.55 * len(row_names) + 0.6), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 1.15 + 1.55 * len(row_names) + 0.6), layout="constrained")
     axes = figure.subplots(1 + len(row_names), 1, sharex=True, height_ratios=[0.75] + [1.5] * len(row_names))
     band = axes[0]
     origin = segments[0].frames[0].capture_time_ns if segments and segments[0].frames else 0
@@ -381,7 +288,7 @@ def motion_figure(
     band.set_yticks([])
     band.grid(False)
     band.spines["left"].set_visible(False)
-    _legend_above(band)
+    legend_above(band)
     times, speed, yaw = _rates(frames)
     seconds = (times - origin) / 1e9
     axes[1].plot(seconds, speed, color=BLUE, lw=1.5)
@@ -404,10 +311,10 @@ def motion_figure(
     return figure
 
 
-@_style()
+@styled()
 def edges_figure(constraints: Sequence[Constraint], min_inlier_ratio: float | None) -> Figure:
     """Inlier ratio, residual and scale of every constraint, at the index of its later submap."""
-    figure = Figure(figsize=(_WIDTH_IN, 6.2), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 6.2), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1, sharex=True)
     groups = (
         (ConstraintKind.ADJACENT, True, "o", BLUE, "adjacent, accepted"),
@@ -431,7 +338,7 @@ def edges_figure(constraints: Sequence[Constraint], min_inlier_ratio: float | No
         )
     top.set_ylim(-0.03, 1.05)
     top.set_ylabel("inlier ratio")
-    _legend_above(top)
+    legend_above(top)
     middle.set_ylabel("median residual\n(% of depth)")
     middle.set_ylim(0.0, _head_room([100.0 * c.median_relative_residual for c in constraints]))
     scales = np.array([c.j_from_i.scale for c in constraints if c.accepted])
@@ -453,11 +360,11 @@ def edges_figure(constraints: Sequence[Constraint], min_inlier_ratio: float | No
     return figure
 
 
-@_style()
+@styled()
 def stages_figure(stage_seconds: Mapping[str, float]) -> Figure:
     """Wall time of the stages of a run."""
     names, values = list(stage_seconds), np.array(list(stage_seconds.values()), np.float64)
-    figure = Figure(figsize=(_WIDTH_IN, 0.9 + 0.36 * max(len(names), 1)), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 0.9 + 0.36 * max(len(names), 1)), layout="constrained")
     axes = figure.subplots()
     axes.barh(np.arange(len(names)), values, color=BLUE, height=0.62)
     axes.set_yticks(np.arange(len(names)), [_short(name) for name in names])
@@ -472,12 +379,12 @@ def stages_figure(stage_seconds: Mapping[str, float]) -> Figure:
     return figure
 
 
-@_style()
+@styled()
 def submap_times_figure(submaps: Sequence[SubmapGeometry]) -> Figure:
     """Time of the predictor's stages for each submap, stacked."""
     shown = sorted(submaps, key=lambda submap: (submap.spec.submap_index, submap.spec.revision))
     stages = list(dict.fromkeys(name for submap in shown for name in submap.stage_seconds))
-    figure = Figure(figsize=(_WIDTH_IN, 3.0), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
     axes = figure.subplots()
     base = np.zeros(len(shown))
     palette = (BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE, YELLOW, "#8c959f")
@@ -502,107 +409,9 @@ def submap_times_figure(submaps: Sequence[SubmapGeometry]) -> Figure:
     axes.set_xlabel("submap")
     axes.set_ylabel("seconds")
     axes.grid(False, axis="x")
-    _legend_above(axes)
+    legend_above(axes)
     return figure
 
 
 def _short(text: str, limit: int = 40) -> str:
     return text if len(text) <= limit else text[: limit - 1] + "…"
-
-
-@_style()
-def map_figure(cloud: PointCloud, frames: ComponentTrack, length_unit: str) -> Figure:
-    """The map from above with the trajectory drawn into it."""
-    path = np.concatenate(
-        [_finite(track).positions for component, track in frames.parts() if component == cloud.component]
-        or [np.zeros((0, 3))]
-    )
-    bounds = _map_bounds(cloud.points, path)
-    plan = _Plan(is_turned=bounds[3] - bounds[2] > 1.3 * (bounds[1] - bounds[0]))
-    ceiling = _ceiling(cloud.points, path, bounds)
-    width_px = (
-        1000 if not plan.is_turned else int(np.clip(1000 * (bounds[1] - bounds[0]) / (bounds[3] - bounds[2]), 60, 1000))
-    )
-    view = render.plan_view(cloud.points, cloud.colors, bounds, width_px, ceiling)
-    figure = Figure(layout="constrained")
-    axes = figure.subplots()
-    if plan.is_turned:
-        # z to the right and x down: rows of the picture become columns, from near to far.
-        axes.imshow(
-            view.image[::-1].transpose(1, 0, 2),
-            extent=(bounds[2], bounds[3], bounds[1], bounds[0]),
-            interpolation="antialiased",
-        )
-        ratio = (bounds[1] - bounds[0]) / (bounds[3] - bounds[2])
-    else:
-        axes.imshow(view.image, extent=bounds, interpolation="antialiased")
-        ratio = (bounds[3] - bounds[2]) / (bounds[1] - bounds[0])
-    if len(path):
-        axes.plot(plan.horizontal(path), plan.vertical(path), "-", color=ORANGE, lw=1.6, label="trajectory")
-        _mark_ends(axes, plan, path, is_labelled=True)
-        _legend_above(axes)
-    axes.grid(False)
-    plan.label(axes, length_unit)
-    figure.set_size_inches(_WIDTH_IN, _panel_inches(ratio, _WIDTH_IN - 0.9) + 0.7)
-    return figure
-
-
-def _map_bounds(points: npt.NDArray[np.floating], path: npt.NDArray[np.floating]) -> tuple[float, float, float, float]:
-    """x_min, x_max, z_min, z_max: the drive and what lies beside it; the few points at the horizon must not rule."""
-    plane = np.asarray(points[:, [0, 2]], np.float64)
-    plane = plane[np.isfinite(plane).all(axis=1)]
-    low, high = np.percentile(plane, [1.0, 99.0], axis=0) if len(plane) else (np.full(2, -1.0), np.full(2, 1.0))
-    if len(path):
-        inner_low, inner_high = path[:, [0, 2]].min(axis=0), path[:, [0, 2]].max(axis=0)
-        margin = 0.3 * max(float((inner_high - inner_low).max()), 1e-6)
-        low = np.minimum(np.maximum(low, inner_low - margin), inner_low - 0.05 * margin)
-        high = np.maximum(np.minimum(high, inner_high + margin), inner_high + 0.05 * margin)
-    high = np.maximum(high, low + 1e-3 * max(float((high - low).max()), 1e-3))
-    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
-
-
-def _ceiling(
-    points: npt.NDArray[np.floating], path: npt.NDArray[np.floating], bounds: tuple[float, float, float, float]
-) -> float | None:
-    """Height (y) above which the map is cut open, lest bridges and tree tops hide the road; None without a path."""
-    if not len(path):
-        return None
-    y = np.asarray(points[:, 1], np.float64)
-    y = y[np.isfinite(y)]
-    below = y[y > float(path[:, 1].max())]
-    if not len(below):
-        return None
-    camera_height = float(np.percentile(below, 90)) - float(np.median(path[:, 1]))
-    return float(path[:, 1].min()) - 2.0 * max(camera_height, 0.0)
-
-
-@_style()
-def camera_view_figure(cloud: PointCloud, view: CameraView) -> Figure:
-    """The map as one camera sees it, beside what it recorded."""
-    target_width = 960
-    scale = target_width / view.intrinsics.width_px
-    intrinsics = view.intrinsics.resized(target_width, max(1, round(view.intrinsics.height_px * scale)))
-    picture = render.camera_view(
-        cloud.points, cloud.colors, view.world_from_camera, intrinsics, _point_size(cloud, view)
-    )
-    pictures = [("map, drawn from the camera", picture)]
-    if view.image is not None:
-        pictures.insert(0, (f"recorded frame {view.frame_index}", view.image))
-    ratio = intrinsics.height_px / intrinsics.width_px
-    is_wide = ratio < 0.5
-    rows, columns = (len(pictures), 1) if is_wide else (1, len(pictures))
-    width = _WIDTH_IN / columns
-    figure = Figure(figsize=(_WIDTH_IN, rows * (ratio * width + 0.32)), layout="constrained")
-    for axes, (title, pixels) in zip(figure.subplots(rows, columns, squeeze=False).flat, pictures, strict=True):
-        axes.imshow(pixels, interpolation="antialiased")
-        axes.set_title(title)
-        axes.set_axis_off()
-    return figure
-
-
-def _point_size(cloud: PointCloud, view: CameraView) -> float:
-    """Edge of a point in world units: about a pixel and a half at the median distance of what the camera sees."""
-    offset = np.asarray(cloud.points, np.float64) - view.world_from_camera[:3, 3]
-    depth = offset @ view.world_from_camera[:3, 2]
-    seen = depth[np.isfinite(depth) & (depth > 0)]
-    return 1.5 * float(np.median(seen)) / view.intrinsics.fx if len(seen) else 1e-3

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vggt_motion.evaluation import plots
+from vggt_motion.evaluation import map_plots, plots
+from vggt_motion.evaluation.plot_style import to_png, to_svg
 from vggt_motion.evaluation.report_data import MetricTree, MetricValue, ReportData
 from vggt_motion.evaluation.report_style import CSS
 from vggt_motion.records import Constraint, Event, EventKind, JobReport, Segment, SubmapGeometry, SubmapVerdict
@@ -108,9 +109,9 @@ def _number(value: float, digits: int = 4) -> str:
 
 def _figure(figure: Figure, name: str, alternative: str, caption: str = "", is_photo: bool = False) -> str:
     if is_photo:
-        media, payload = "image/png", plots.to_png(figure, 125)
+        media, payload = "image/png", to_png(figure, 125)
     else:
-        media, payload = "image/svg+xml", plots.to_svg(figure)
+        media, payload = "image/svg+xml", to_svg(figure)
     width_px = round(float(figure.get_size_inches()[0]) * 105)
     encoded = base64.b64encode(payload).decode("ascii")
     note = f"<figcaption>{_text(caption)}</figcaption>" if caption else ""
@@ -289,7 +290,7 @@ def _map(data: ReportData) -> str:
     if data.cloud is None or not len(data.cloud.points):
         return _none("No map was made.")
     out = _figure(
-        plots.map_figure(data.cloud, data.frames, data.length_unit),
+        map_plots.map_figure(data.cloud, data.frames, data.length_unit),
         "map",
         "The map's points from above with the trajectory",
         f"{_number(len(data.cloud.points))} points from above, cut open above the camera; "
@@ -298,7 +299,7 @@ def _map(data: ReportData) -> str:
     )
     if data.camera_view is not None:
         out += _figure(
-            plots.camera_view_figure(data.cloud, data.camera_view),
+            map_plots.camera_view_figure(data.cloud, data.camera_view),
             "camera",
             "The map's points as a camera sees them, beside the recorded frame",
             "The map drawn from one of its cameras: where it is right, it looks like the recorded frame. "
