@@ -167,12 +167,29 @@ class BlobFiles:
                 if _SHA256.fullmatch(path.name) and path.name.startswith(folder.name):
                     yield path.name
 
-    def remove(self, sha256: str) -> int:
-        """Delete a file that no record refers to; returns its size in bytes."""
-        path = self._path(sha256)
-        size_bytes = path.stat().st_size
-        path.unlink()
-        return size_bytes
+    def size_bytes(self, sha256: str) -> int:
+        """Size of a stored file."""
+        return self._path(sha256).stat().st_size
+
+    def problem(self, sha256: str, size_bytes: int) -> str:
+        """What is wrong with a stored file; empty if it is what it should be.
+
+        Raises:
+            UnknownError: there is no such file.
+        """
+        try:
+            data = self._path(sha256).read_bytes()
+        except FileNotFoundError:
+            raise UnknownError(f"no blob {sha256}") from None
+        except OSError as error:
+            return error.strerror or str(error)
+        if len(data) != size_bytes:
+            return f"{len(data)} bytes in place of {size_bytes}"
+        return "" if sha256_hex(data) == sha256 else "another content"
+
+    def remove(self, sha256: str) -> None:
+        """Delete a file that no record refers to."""
+        self._path(sha256).unlink()
 
     def set_aside(self, sha256: str) -> None:
         """Move a damaged file to ``damaged/``, where a person can look at it."""

@@ -26,13 +26,18 @@ from vggt_motion.records import JobReport
 DATABASE_NAME: Final = "ledger.db"
 LOCK_NAME: Final = "session.lock"
 BLOBS_NAME: Final = "blobs"
+_PATIENCE_S = 0.5
 
 
 class SessionLock:
     """The exclusive right to a session's directory; ends with the process at the latest, however it ends."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, *, patience_s: float = _PATIENCE_S) -> None:
         """Take the lock.
+
+        Args:
+            directory: it must be there.
+            patience_s: how long to wait for a process that is ending, or that only looks.
 
         Raises:
             LedgerError: another process has it, or the directory cannot be written.
@@ -42,12 +47,14 @@ class SessionLock:
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise LedgerError(f"cannot write to {directory}: {error.strerror or error}") from error
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        end_s = time.monotonic() + patience_s
+        while not _try_lock(self._descriptor):
+            if time.monotonic() < end_s:
+                time.sleep(0.02)
+                continue
             holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
             os.close(self._descriptor)
-            raise LedgerError(f"{directory} is in use by another process ({holder or 'unknown'})") from error
+            raise LedgerError(f"{directory} is in use by another process ({holder or 'unknown'})")
         os.ftruncate(self._descriptor, 0)
         os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 
@@ -56,6 +63,26 @@ class SessionLock:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
+
+
+def is_in_use(directory: Path) -> bool:
+    """Whether a process serves the session at this moment."""
+    try:
+        descriptor = os.open(directory / LOCK_NAME, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        return not _try_lock(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _try_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -79,7 +79,7 @@ class Store:
         """
         self._rows = rows
         self._blobs = blobs
-        self._reserve_bytes = reserve_bytes
+        self.reserve_bytes = reserve_bytes
         self._input_streams = frozenset(input_streams)
         self._time_ns = time_ns
 
@@ -108,7 +108,7 @@ class Store:
         """Make the blobs of a record durable before its row; returns every blob that the record refers to."""
         if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
             raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")
-        keep_free_bytes = self._reserve_bytes if is_input else self._reserve_bytes // 2
+        keep_free_bytes = self.reserve_bytes if is_input else self.reserve_bytes // 2
         free_bytes = self._blobs.free_bytes()
         if free_bytes < keep_free_bytes:
             raise DiskFullError(reserve_line(free_bytes, keep_free_bytes))
@@ -178,7 +178,7 @@ class Store:
     @property
     def is_accepting(self) -> bool:
         """Whether there is space for new input."""
-        return self._blobs.free_bytes() >= self._reserve_bytes
+        return self._blobs.free_bytes() >= self.reserve_bytes
 
     def _find_known(self, reader: Reader, record: NewRecord) -> RecordRow | None:
         known = reader.find_record(record.stream, record.record_id)

@@ -11,7 +11,7 @@ import dataclasses
 import queue
 import sqlite3
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -59,6 +59,10 @@ class _Statements:
             FROM record_blobs JOIN blobs ON blobs.sha256 = record_blobs.sha256
             WHERE stream = ? AND sequence = ? ORDER BY blobs.sha256"""
         return [BlobEntry(*row) for row in self._all(statement, stream, sequence)]
+
+    def blobs(self) -> Iterable[BlobEntry]:
+        for row in self._connection.execute("SELECT sha256, size_bytes FROM blobs ORDER BY sha256"):
+            yield BlobEntry(*row)
 
     def blob_bytes(self) -> int:
         return int(self._value("SELECT COALESCE(SUM(size_bytes), 0) FROM blobs"))

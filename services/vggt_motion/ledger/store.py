@@ -10,7 +10,7 @@ Policy (what is idempotent, when a job is dead) lives in :mod:`.log` and :mod:`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -126,6 +126,9 @@ class Reader(Protocol):
 
     def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
         """The blobs that a record refers to."""
+
+    def blobs(self) -> Iterable[BlobEntry]:
+        """All blobs in order of their hash, as long as the query lasts."""
 
     def blob_bytes(self) -> int:
         """Sum of the sizes of all blobs, each counted once."""

@@ -1,0 +1,135 @@
+"""A session as one file, and back: a tar archive with the database and the blobs that its records refer to."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import tarfile
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from vggt_motion.errors import InputError, LedgerError
+from vggt_motion.ledger.blobs import BlobFiles, FileOperations, sha256_hex
+from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, locked
+from vggt_motion.ledger.sqlite import copy_database, read_only
+from vggt_motion.ledger.store import BlobEntry
+
+_MAX_BLOB_BYTES = 2**30
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What went into or came out of an archive."""
+
+    record_counts: dict[str, int]
+    blob_count: int
+    archive_bytes: int
+
+
+def export_session(directory: Path, archive: Path) -> ExportReport:
+    """Write a session to a tar file; it may be served meanwhile, what comes later is not in it.
+
+    Args:
+        directory: of the session.
+        archive: file to write; appears under its name only when it is whole.
+
+    Raises:
+        InputError: the archive cannot be written, or is there already.
+        LedgerError: no session of ours, or a damaged one.
+    """
+    if archive.exists():
+        raise InputError(f"{archive} is there already")
+    partial = archive.with_name(archive.name + ".partial")
+    try:
+        with tempfile.TemporaryDirectory(dir=archive.parent) as scratch, tarfile.open(partial, "w") as tar:
+            snapshot = Path(scratch) / DATABASE_NAME
+            copy_database(directory / DATABASE_NAME, snapshot)
+            tar.add(snapshot, DATABASE_NAME)
+            with read_only(snapshot) as reader:
+                counts = dict(reader.positions())
+                entries = list(reader.blobs())
+            # Blobs never change and are never removed while a record refers to them: no lock is needed.
+            blobs = directory / BLOBS_NAME
+            for entry in entries:
+                _add(tar, entry, blobs / entry.sha256[:2] / entry.sha256)
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        FileOperations().rename(partial, archive)
+        FileOperations().sync_folder(archive.parent)
+    except OSError as error:
+        raise InputError(f"cannot write {archive}: {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return ExportReport(counts, len(entries), archive.stat().st_size)
+
+
+def import_session(archive: Path, directory: Path) -> ExportReport:
+    """Make a session from a tar file; everything is verified before the database is put in its place.
+
+    Args:
+        archive: file that :func:`export_session` wrote.
+        directory: new or empty.
+
+    Raises:
+        InputError: not such an archive, damaged, or the directory holds something.
+    """
+    if directory.exists() and any(directory.iterdir()):
+        raise InputError(f"{directory} is not empty")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with locked(directory):
+            return _import(archive, directory)
+    except (OSError, tarfile.TarError, LedgerError) as error:
+        shutil.rmtree(directory, ignore_errors=True)
+        raise InputError(f"cannot import {archive}: {error}") from error
+    except BaseException:
+        shutil.rmtree(directory, ignore_errors=True)
+        raise
+
+
+def _import(archive: Path, directory: Path) -> ExportReport:
+    blobs = BlobFiles(directory / BLOBS_NAME)
+    found: set[BlobEntry] = set()
+    snapshot = directory / f"{DATABASE_NAME}.partial"
+    with tarfile.open(archive, "r:") as tar:
+        for member in tar:
+            content = tar.extractfile(member) if member.isreg() else None
+            if content is None:
+                raise InputError(f"cannot import {archive}: '{member.name[:80]}' is not a file")
+            if member.name == DATABASE_NAME:
+                with snapshot.open("wb") as file:
+                    shutil.copyfileobj(content, file)
+                    file.flush()
+                    os.fsync(file.fileno())
+                continue
+            if member.size > _MAX_BLOB_BYTES:
+                raise InputError(f"cannot import {archive}: a blob of {member.size} bytes")
+            (entry,) = blobs.put([content.read()], keep_free_bytes=0)
+            if PurePosixPath(member.name) != PurePosixPath(BLOBS_NAME, entry.sha256[:2], entry.sha256):
+                raise InputError(f"cannot import {archive}: '{member.name[:80]}' is damaged or not of a session")
+            found.add(entry)
+    if not snapshot.is_file():
+        raise InputError(f"cannot import {archive}: there is no {DATABASE_NAME} in it")
+    with read_only(snapshot) as reader:
+        counts = dict(reader.positions())
+        missing = set(reader.blobs()) - found
+    if missing:
+        raise InputError(f"cannot import {archive}: {len(missing)} blobs are missing")
+    FileOperations().rename(snapshot, directory / DATABASE_NAME)
+    FileOperations().sync_folder(directory)
+    return ExportReport(counts, len(found), archive.stat().st_size)
+
+
+def _add(tar: tarfile.TarFile, entry: BlobEntry, path: Path) -> None:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise LedgerError(f"blob {entry.sha256} is missing; run a check") from None
+    if BlobEntry(sha256_hex(data), len(data)) != entry:
+        raise LedgerError(f"blob {entry.sha256} is damaged; run a check")
+    info = tarfile.TarInfo(f"{BLOBS_NAME}/{entry.sha256[:2]}/{entry.sha256}")
+    info.size = len(data)
+    info.mode = 0o644
+    tar.addfile(info, io.BytesIO(data))

@@ -1,0 +1,309 @@
+from __future__ import annotations
+
+import hashlib
+import io
+import sqlite3
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from ledger_helpers import open_ledger, predict, record
+from vggt_motion.bus import codec
+from vggt_motion.errors import InputError, LedgerError
+from vggt_motion.ledger.check import check
+from vggt_motion.ledger.export import export_session, import_session
+from vggt_motion.ledger.sessions import (
+    SessionIdentity,
+    SessionState,
+    identity_of,
+    list_sessions,
+    prepare_session,
+    remove_session,
+    summary_of,
+)
+from vggt_motion.ledger.store import BlobEntry, NewRecord
+from vggt_motion.records import Event, EventKind, JobKind
+
+IDENTITY = SessionIdentity("street.mp4", "video:1", "config:1")
+
+
+def entry(data: bytes) -> BlobEntry:
+    return BlobEntry(hashlib.sha256(data).hexdigest(), len(data))
+
+
+def blob_path(directory: Path, data: bytes) -> Path:
+    name = entry(data).sha256
+    return directory / "blobs" / name[:2] / name
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    """A closed session with two streams, two blobs and two jobs, one of them done."""
+    directory = tmp_path / "run" / "ledger"
+    ledger = open_ledger(directory)
+    ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")])
+    ledger.store.append(record("keyframe", "k1"), [b"other"], [entry(b"other"), entry(b"image")])
+    ledger.jobs.submit([predict("s0"), predict("s1")])
+    lease = ledger.jobs.claim([JobKind.PREDICT], [], "inference/a")
+    assert lease is not None
+    ledger.jobs.done("s0", lease.lease_id, record("submap", "s0"))
+    ledger.close()
+    return directory
+
+
+def execute(directory: Path, statement: str) -> None:
+    connection = sqlite3.connect(directory / "ledger.db")
+    with connection:
+        connection.executescript(statement)
+    connection.close()
+
+
+def test_a_sound_session_is_found_sound(session: Path) -> None:
+    report = check(session)
+    assert report.is_sound and report.repaired == ()
+    assert report.record_counts == {"keyframe": 2, "submap": 1}
+    assert (report.job_count, report.blob_count) == (2, 2)
+    assert report.stored_bytes == (session / "ledger.db").stat().st_size + len(b"image") + len(b"other")
+
+
+def test_what_an_interrupted_write_left_is_repaired(session: Path) -> None:
+    ledger = open_ledger(session)
+    ledger.blobs.put([b"written, but its row never was"], keep_free_bytes=0)
+    ledger.close()
+    (session / "blobs" / "incoming" / "torn.0").write_bytes(b"to")
+    before = check(session, repair=False)
+    assert blob_path(session, b"written, but its row never was").exists()
+    assert (session / "blobs" / "incoming" / "torn.0").exists() is False or before.repaired
+    report = check(session)
+    assert report.is_sound
+    assert any("1 blobs of writes that were never acknowledged" in line for line in report.repaired)
+    assert not blob_path(session, b"written, but its row never was").exists()
+    assert check(session).repaired == ()
+
+
+def test_a_torn_write_ahead_log_is_recovered_and_reported(session: Path, tmp_path: Path) -> None:
+    ledger = open_ledger(session)
+    ledger.store.append(record("event", "acknowledged"))
+    size = (session / "ledger.db-wal").stat().st_size
+    ledger.store.append(record("event", "torn", bytes(10_000)))
+    image = tmp_path / "image"
+    image.mkdir()
+    (image / "ledger.db").write_bytes((session / "ledger.db").read_bytes())
+    (image / "ledger.db-wal").write_bytes((session / "ledger.db-wal").read_bytes()[: size + 5000])
+    for path in (session / "blobs").glob("??/*"):
+        target = image / path.relative_to(session)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    ledger.close()
+    report = check(image)
+    assert report.is_sound and report.record_counts["event"] == 1
+    assert report.repaired == ("the write-ahead log of an interrupted process was folded into the database",)
+    assert check(image).repaired == ()
+
+
+@pytest.mark.parametrize("damage", [b"imagE", b"imag", b""])
+def test_a_damaged_blob_is_named_set_aside_and_healed_by_appending_again(session: Path, damage: bytes) -> None:
+    blob_path(session, b"image").write_bytes(damage)
+    assert not check(session, repair=False).is_sound
+    report = check(session)
+    (problem,) = report.problems
+    assert problem.startswith(f"keyframe/0 ('k0'): blob {entry(b'image').sha256} is damaged")
+    assert not blob_path(session, b"image").exists()
+    (problem,) = check(session).problems
+    assert "is missing" in problem
+    ledger = open_ledger(session)
+    assert ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")]).was_known
+    ledger.close()
+    assert check(session).is_sound
+
+
+@pytest.mark.parametrize(
+    ("statement", "problem"),
+    [
+        ("UPDATE records SET payload = x'00' WHERE record_id = 'k1'", "keyframe/1 ('k1'): the record is not what was"),
+        ("UPDATE records SET record_id = 'other' WHERE record_id = 'k1'", "keyframe/1 ('other'): the record is not"),
+        ("DELETE FROM records WHERE record_id = 'k0'", "keyframe: records 0 to 0 are missing"),
+        ("DELETE FROM record_blobs; DELETE FROM records WHERE record_id = 'k1'", "keyframe: the last 1 records are missing"),
+    ],
+)
+def test_a_damaged_row_is_named(session: Path, statement: str, problem: str) -> None:
+    execute(session, statement)
+    report = check(session)
+    assert any(line.startswith(problem) for line in report.problems), report.problems
+    assert blob_path(session, b"image").exists(), "what a damaged row may refer to is kept"
+
+
+def test_a_job_that_is_done_without_a_result_is_opened_again(session: Path) -> None:
+    execute(session, "UPDATE jobs SET state = 'done' WHERE job_id = 's1'")
+    report = check(session)
+    assert report.is_sound
+    assert report.repaired == ("job 's1' was done without a result and is open again",)
+    ledger = open_ledger(session)
+    assert ledger.jobs.counts() == {("predict", "done"): 1, ("predict", "open"): 1}
+    ledger.close()
+
+
+def test_a_damaged_index_is_rebuilt(session: Path) -> None:
+    connection = sqlite3.connect(session / "ledger.db")
+    with connection:
+        # An index that lacks a row: filled under another name, then put in the place of the real one.
+        connection.execute("PRAGMA writable_schema = ON")
+        (sql,) = connection.execute("SELECT sql FROM sqlite_master WHERE name = 'jobs_by_state'").fetchone()
+        connection.execute("UPDATE sqlite_master SET sql = NULL, type = 'index' WHERE 0")
+        connection.execute(
+            "UPDATE sqlite_master SET sql = ? WHERE name = 'jobs_by_state'", (sql + " WHERE state <> 'open'",)
+        )
+    connection.close()
+    connection = sqlite3.connect(session / "ledger.db")
+    with connection:
+        connection.execute("REINDEX")
+        connection.execute("PRAGMA writable_schema = ON")
+        connection.execute("UPDATE sqlite_master SET sql = ? WHERE name = 'jobs_by_state'", (sql,))
+    connection.close()
+    report = check(session)
+    assert report.is_sound, report.problems
+    assert any("wrong index entries rebuilt" in line for line in report.repaired)
+    assert check(session).repaired == ()
+
+
+def test_a_damaged_page_of_the_database_is_found_and_never_ends_in_a_traceback(session: Path) -> None:
+    whole = (session / "ledger.db").read_bytes()
+    for offset in range(0, len(whole), 4096):
+        (session / "ledger.db").write_bytes(whole[:offset] + b"\xff" * 64 + whole[offset + 64 :])
+        report = check(session)
+        assert not report.is_sound or report.repaired, f"offset {offset}"
+        assert all("\n" not in line for line in report.problems)
+
+
+def test_a_session_in_use_and_a_folder_without_one_are_refused_in_one_line(session: Path, tmp_path: Path) -> None:
+    ledger = open_ledger(session)
+    with pytest.raises(LedgerError, match="in use by another process"):
+        check(session)
+    ledger.close()
+    with pytest.raises(LedgerError, match="holds no ledger"):
+        check(tmp_path)
+
+
+# Sessions
+
+
+def event(event_id: str, kind: EventKind, **detail: str) -> NewRecord:
+    value = Event(event_id, kind, event_id, 123, detail)
+    return NewRecord("event", event_id, codec.payload_type(Event), codec.encode(value), codec.identity_digest(value))
+
+
+def test_sessions_are_listed_while_they_are_served(session: Path, tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "second")
+    ledger.store.append(
+        event("session_started", EventKind.SESSION_STARTED, source="street.mp4", source_fingerprint="video:1")
+    )
+    ledger.store.append(event("run_ended", EventKind.RUN_ENDED))
+    (tmp_path / "elsewhere").mkdir()
+    first, second = list_sessions(tmp_path)
+    assert (first.directory, first.source, first.is_ended, first.is_in_use) == (session, "", False, False)
+    assert first.record_counts == {"keyframe": 2, "submap": 1}
+    assert (second.source, second.source_fingerprint, second.started_ns) == ("street.mp4", "video:1", 123)
+    assert second.is_ended and second.is_in_use and second.problem == ""
+    ledger.close()
+    assert not list_sessions(tmp_path / "second")[0].is_in_use
+    assert first.stored_bytes == check(session).stored_bytes
+
+
+def test_a_session_that_cannot_be_read_is_listed_with_its_problem(session: Path, tmp_path: Path) -> None:
+    (session / "ledger.db").write_bytes(b"garbage" * 1000)
+    (summary,) = list_sessions(tmp_path)
+    assert "\n" not in summary.problem and summary.problem
+    with pytest.raises(InputError, match="not a folder"):
+        list_sessions(tmp_path / "missing")
+
+
+def test_a_directory_belongs_to_one_source_and_configuration(tmp_path: Path) -> None:
+    directory = tmp_path / "out" / "ledger"
+    assert identity_of(directory) is None
+    assert prepare_session(directory, IDENTITY) is SessionState.NEW
+    assert identity_of(directory) == IDENTITY
+    assert prepare_session(directory, IDENTITY) is SessionState.UNFINISHED
+    with pytest.raises(InputError, match=r"another source \(street.mp4\)"):
+        prepare_session(directory, SessionIdentity("b.mp4", "video:2", "config:1"))
+    with pytest.raises(InputError, match="another configuration"):
+        prepare_session(directory, SessionIdentity("street.mp4", "video:1", "config:2"))
+    ledger = open_ledger(directory)
+    ledger.store.append(event("run_ended", EventKind.RUN_ENDED))
+    ledger.close()
+    assert prepare_session(directory, IDENTITY) is SessionState.FINISHED
+    assert summary_of(directory).source == "street.mp4"
+    remove_session(directory)
+    assert prepare_session(directory, IDENTITY) is SessionState.NEW
+
+
+def test_a_session_that_does_not_say_what_it_is_is_not_taken_over(session: Path) -> None:
+    with pytest.raises(InputError, match="unknown source"):
+        prepare_session(session, IDENTITY)
+
+
+def test_a_session_in_use_is_not_removed(session: Path) -> None:
+    ledger = open_ledger(session)
+    with pytest.raises(LedgerError, match="in use"):
+        remove_session(session)
+    ledger.close()
+    (session / "notes.txt").write_text("mine")
+    remove_session(session)
+    assert [path.name for path in session.iterdir() if path.name != "session.lock"] == ["notes.txt"]
+
+
+# Export
+
+
+def test_a_session_comes_out_of_an_archive_as_it_went_in(session: Path, tmp_path: Path) -> None:
+    ledger = open_ledger(session)  # exporting needs no lock
+    report = export_session(session, tmp_path / "session.tar")
+    ledger.store.append(record("keyframe", "k2"))
+    rows = ledger.store.read("keyframe", limit=2)
+    ledger.close()
+    assert (report.record_counts, report.blob_count) == ({"keyframe": 2, "submap": 1}, 2)
+    assert report.archive_bytes == (tmp_path / "session.tar").stat().st_size
+    assert import_session(tmp_path / "session.tar", tmp_path / "copy") == report
+    assert check(tmp_path / "copy").is_sound
+    copy = open_ledger(tmp_path / "copy")
+    assert copy.store.read("keyframe") == rows
+    assert copy.store.blob(entry(b"image").sha256) == b"image"
+    assert copy.jobs.counts() == {("predict", "done"): 1, ("predict", "open"): 1}
+    copy.close()
+
+
+def test_a_damaged_session_is_not_exported(session: Path, tmp_path: Path) -> None:
+    blob_path(session, b"image").write_bytes(b"imagE")
+    with pytest.raises(LedgerError, match="damaged"):
+        export_session(session, tmp_path / "session.tar")
+    assert not list(tmp_path.glob("session.tar*"))
+
+
+def test_archives_that_are_not_ours_are_refused_and_leave_nothing(session: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "session.tar"
+    export_session(session, archive)
+    with pytest.raises(InputError, match="there already"):
+        export_session(session, archive)
+    with pytest.raises(InputError, match="not empty"):
+        import_session(archive, session)
+    whole = archive.read_bytes()
+
+    def refused(data: bytes) -> None:
+        (tmp_path / "bad.tar").write_bytes(data)
+        with pytest.raises(InputError, match="cannot import"):
+            import_session(tmp_path / "bad.tar", tmp_path / "copy")
+        assert not (tmp_path / "copy").exists()
+
+    refused(b"")
+    refused(b"no archive")
+    refused(whole[: len(whole) // 2])
+    refused(whole.replace(b"image", b"imagE"))
+    for name, kind in (("../escape", tarfile.REGTYPE), ("/etc/escape", tarfile.REGTYPE), ("link", tarfile.SYMTYPE)):
+        buffer = io.BytesIO()
+        with tarfile.open(fileobj=buffer, mode="w") as tar:
+            info = tarfile.TarInfo(name)
+            info.type = kind
+            info.size = 1 if kind == tarfile.REGTYPE else 0
+            tar.addfile(info, io.BytesIO(b"x"))
+        refused(buffer.getvalue())
+    assert not (tmp_path / "escape").exists()
