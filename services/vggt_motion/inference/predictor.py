@@ -87,6 +87,10 @@ class Predictor(Protocol):
 _REGISTRY: dict[str, str] = {
     "sfm": "vggt_motion.inference.sfm.predictor:create",
     "vggt": "vggt_motion.inference.vggt:create",
+    "pi3": "vggt_motion.inference.pi3:create",
+    "pi3x": "vggt_motion.inference.pi3:create_x",
+    "depth_anything_3": "vggt_motion.inference.depth_anything:create",
+    "map_anything": "vggt_motion.inference.map_anything:create",
 }
 AUTO = "auto"
 
