@@ -144,11 +144,13 @@ def test_views_decode_with_the_schemas_in_the_file(tmp_path: Path) -> None:
     points = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 6.25]])
     colours = np.array([[10, 20, 30], [200, 100, 0]], dtype=np.uint8)
     with Recording.open(path, chunk_bytes=CHUNK_BYTES) as recording:
-        recording.add_pose(7, pose_in_frame(world_from_camera, "world", 12_345_678_901), 12_345_678_901)
+        seventh = FrameId("front", 0, 7)
+        recording.add_pose(seventh, pose_in_frame(world_from_camera, "world", 12_345_678_901), 12_345_678_901)
         recording.add_trajectory(2, poses_in_frame([np.eye(4), world_from_camera], "world", 5), 5)
         recording.add_map(2, point_cloud(points, colours, "world", 5), 5)
         recording.add_transform(frame_transform(world_from_camera, "world", "camera/front", 5), 5)
-        assert recording.has_pose(7) and not recording.has_pose(6)
+        assert recording.has_pose(seventh) and not recording.has_pose(FrameId("front", 0, 6))
+        assert (recording.view_revision("/map"), recording.view_revision("/tf")) == (2, -1)
     assert doctor(path) == []
     decoded = {}
     with path.open("rb") as file:

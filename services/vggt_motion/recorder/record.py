@@ -26,7 +26,7 @@ import threading
 import time
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -36,7 +36,7 @@ from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, IndexType, Writer
 
 from vggt_motion import __version__
-from vggt_motion.errors import CodecError, InputError, SourceError
+from vggt_motion.errors import CodecError, InputError, SourceError, VggtMotionError
 from vggt_motion.foxglove import MAP_FRAME, MAP_FROM_WORLD, WORLD_FRAME, encode_image, frame_transform
 from vggt_motion.recorder import schemas
 from vggt_motion.recorder.container import MAGIC, McapScanner, StoredMessage
@@ -83,6 +83,10 @@ class _Channel:
     metadata: tuple[tuple[str, str], ...] = ()
 
 
+class RecordingClosedError(VggtMotionError):
+    """The file has been closed meanwhile; what was to be added is not in it."""
+
+
 class Recording:
     """One MCAP file being written. Safe to use from several threads."""
 
@@ -100,7 +104,8 @@ class Recording:
         self._positions: dict[str, int] = {}
         self._frames: dict[tuple[str, int], IndexSet] = {}
         self._unnumbered_counts: dict[str, int] = {}
-        self._posed = IndexSet()
+        self._posed: dict[tuple[str, int], IndexSet] = {}
+        self._view_revisions: dict[str, int] = {}
         self._recent_blobs: OrderedDict[str, None] = OrderedDict()
         self._recent_frames: OrderedDict[tuple[str, int, int], None] = OrderedDict()
 
@@ -164,10 +169,15 @@ class Recording:
         with self._lock:
             return camera not in self._unnumbered_counts
 
-    def has_pose(self, frame_index: int) -> bool:
+    def has_pose(self, frame_id: FrameId) -> bool:
         """Whether the pose of a keyframe is in the file."""
         with self._lock:
-            return frame_index in self._posed
+            return frame_id.index in self._posed.get((frame_id.camera, frame_id.epoch), ())
+
+    def view_revision(self, topic: str) -> int:
+        """Revision of the graph that the last message of ``/trajectory`` or ``/map`` shows; -1 without one."""
+        with self._lock:
+            return self._view_revisions.get(topic, -1)
 
     @property
     def log_time_ns(self) -> int:
@@ -187,9 +197,11 @@ class Recording:
         if not 0 <= frame_id.index <= _MAX_SEQUENCE:
             raise CodecError(f"frame index {frame_id.index} is out of range")
         with self._lock:
-            if not self._frames.setdefault((frame_id.camera, frame_id.epoch), IndexSet()).add(frame_id.index):
+            known = self._frames.setdefault((frame_id.camera, frame_id.epoch), IndexSet())
+            if frame_id.index in known:
                 return False
             self._add(_image_channel(frame_id.camera, frame_id.epoch), frame_id.index, frame.capture_time_ns, payload)
+            known.add(frame_id.index)
         return True
 
     def add_unnumbered_frame(self, camera: str, encoded: bytes, media_type: str, capture_time_ns: int) -> bool:
@@ -206,8 +218,8 @@ class Recording:
             if not self._is_new_frame(camera, capture_time_ns, encoded):
                 return False
             index = self._unnumbered_counts.get(camera, 0)
-            self._unnumbered_counts[camera] = index + 1
             self._add(_image_channel(camera, None), index & _MAX_SEQUENCE, capture_time_ns, payload)
+            self._unnumbered_counts[camera] = index + 1
         return True
 
     def add_entry(self, entry: LogEntry, capture_time_ns: int | None = None) -> bool:
@@ -249,23 +261,28 @@ class Recording:
             if ref.sha256 in self._recent_blobs:
                 self._recent_blobs.move_to_end(ref.sha256)
                 return False
-            _remember(self._recent_blobs, ref.sha256)
             self._add(_Channel(BLOB_TOPIC, schemas.BLOB), 0, None, message.SerializeToString())
+            _remember(self._recent_blobs, ref.sha256)
         return True
 
-    def add_pose(self, frame_index: int, payload: bytes, capture_time_ns: int) -> None:
+    def add_pose(self, frame_id: FrameId, payload: bytes, capture_time_ns: int) -> None:
         """Record a foxglove.PoseInFrame of a keyframe."""
+        channel = _Channel(POSE_TOPIC, schemas.POSE, _metadata(frame_id.camera, frame_id.epoch))
         with self._lock:
-            self._posed.add(frame_index)
-            self._add(_Channel(POSE_TOPIC, schemas.POSE), frame_index, capture_time_ns, payload)
+            self._add(channel, frame_id.index, capture_time_ns, payload)
+            self._posed.setdefault((frame_id.camera, frame_id.epoch), IndexSet()).add(frame_id.index)
 
     def add_trajectory(self, revision: int, payload: bytes, capture_time_ns: int) -> None:
         """Record a foxglove.PosesInFrame of all keyframes at one revision of the graph."""
-        self._add(_Channel(TRAJECTORY_TOPIC, schemas.TRAJECTORY), revision, capture_time_ns, payload)
+        with self._lock:
+            self._add(_Channel(TRAJECTORY_TOPIC, schemas.TRAJECTORY), revision, capture_time_ns, payload)
+            self._view_revisions[TRAJECTORY_TOPIC] = revision
 
     def add_map(self, revision: int, payload: bytes, capture_time_ns: int) -> None:
         """Record a foxglove.PointCloud of the map at one revision of the graph."""
-        self._add(_Channel(MAP_TOPIC, schemas.POINTS), revision, capture_time_ns, payload)
+        with self._lock:
+            self._add(_Channel(MAP_TOPIC, schemas.POINTS), revision, capture_time_ns, payload)
+            self._view_revisions[MAP_TOPIC] = revision
 
     def add_transform(self, payload: bytes, capture_time_ns: int) -> None:
         """Record a foxglove.FrameTransform."""
@@ -347,10 +364,11 @@ class Recording:
         channel = message.channel
         metadata = channel.metadata
         if CAMERA in metadata:
-            camera = metadata[CAMERA]
-            if metadata.get(NUMBERED) == "true":
-                indices = self._frames.setdefault((camera, int(metadata[EPOCH])), IndexSet())
-                if not indices.add(message.sequence):
+            camera, epoch = metadata[CAMERA], int(metadata[EPOCH])
+            if channel.topic == POSE_TOPIC:
+                self._posed.setdefault((camera, epoch), IndexSet()).add(message.sequence)
+            elif metadata.get(NUMBERED) == "true":
+                if not self._frames.setdefault((camera, epoch), IndexSet()).add(message.sequence):
                     return
             else:
                 self._unnumbered_counts[camera] = self._unnumbered_counts.get(camera, 0) + 1
@@ -363,8 +381,8 @@ class Recording:
             self._positions[stream] = self._positions.get(stream, 0) + 1
         elif channel.topic == BLOB_TOPIC:
             _remember(self._recent_blobs, recording_pb2.Blob.FromString(message.data).ref.sha256)
-        elif channel.topic == POSE_TOPIC:
-            self._posed.add(message.sequence)
+        elif channel.topic in (TRAJECTORY_TOPIC, MAP_TOPIC):
+            self._view_revisions[channel.topic] = message.sequence
         self._last_log_time_ns = max(self._last_log_time_ns, message.log_time_ns)
         own = _Channel(channel.topic, channel.schema_name, tuple(sorted(metadata.items())))
         self._write(own, message.sequence, message.log_time_ns, message.publish_time_ns, message.data)
@@ -378,6 +396,8 @@ class Recording:
 
     def _add(self, channel: _Channel, sequence: int, publish_time_ns: int | None, payload: bytes) -> None:
         with self._lock:
+            if self._is_closed:
+                raise RecordingClosedError(f"{self.path} is closed")
             # Clocks step back; the log of a recording does not.
             self._last_log_time_ns = max(self._last_log_time_ns, self._clock())
             publish = self._last_log_time_ns if publish_time_ns is None else publish_time_ns
@@ -404,13 +424,13 @@ def _remember(recent: OrderedDict[_Key, None], key: _Key) -> None:
         recent.popitem(last=False)
 
 
-def image_metadata(camera: str, epoch: int | None) -> Mapping[str, str]:
-    """Metadata of an image channel; ``epoch`` None = the publisher does not number its frames."""
-    return {CAMERA: camera, EPOCH: str(epoch or 0), NUMBERED: "false" if epoch is None else "true"}
+def _metadata(camera: str, epoch: int | None) -> tuple[tuple[str, str], ...]:
+    """Metadata of a camera's channels; ``epoch`` None = the publisher does not number its frames."""
+    return ((CAMERA, camera), (EPOCH, str(epoch or 0)), (NUMBERED, "false" if epoch is None else "true"))
 
 
 def _image_channel(camera: str, epoch: int | None) -> _Channel:
-    return _Channel(image_topic(camera), schemas.IMAGE, tuple(sorted(image_metadata(camera, epoch).items())))
+    return _Channel(image_topic(camera), schemas.IMAGE, _metadata(camera, epoch))
 
 
 def _log_entry_message(entry: LogEntry) -> bytes:

@@ -1,0 +1,382 @@
+"""The recorder as a service: frames from the image keys, records and payloads from the ledger, views of what they say.
+
+What the file holds is decided by the file alone: after a restart, streams go on at the record that it lacks, and no
+frame is written twice. Frames that only went by while no recorder was there are taken from the ledger where they are
+keyframes; the others are counted as missing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+
+from vggt_motion.backend.state import LogState
+from vggt_motion.backend.trajectory import compose
+from vggt_motion.bus import codec
+from vggt_motion.bus.follow import Followed, Follower
+from vggt_motion.bus.images import decode_image
+from vggt_motion.bus.log import RECORD_OF_STREAM, LogRecord
+from vggt_motion.bus.service import ServiceContext, run_service
+from vggt_motion.bus.session import Sample
+from vggt_motion.config import Config
+from vggt_motion.errors import (
+    BusUnavailableError,
+    CodecError,
+    DiskFullError,
+    InputError,
+    LedgerError,
+    RequestRefusedError,
+    VggtMotionError,
+)
+from vggt_motion.recorder.record import FrameId, Recording, RecordingClosedError
+from vggt_motion.recorder.views import ViewWriter
+from vggt_motion.records import (
+    BlobRef,
+    GraphUpdate,
+    Keyframe,
+    LogEntry,
+    Segment,
+    Stream,
+    SubmapGeometry,
+)
+from vggt_motion.session_map import build_session_map
+from vggt_motion.sources.source import Frame
+
+_log = logging.getLogger(__name__)
+RECORDING_FILE = "run.mcap"
+_POLL_S = 0.02
+_REPORT_S = 0.5
+_RECORDS_A_TURN = 100
+_FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
+_BLOB_PATIENCE_S = 2.0
+_VIEW_REST = 4.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
+_VIEW_POINTS = 200_000
+
+
+def main(config: Config, *, directory: Path) -> int:
+    """Record the session into ``directory/run.mcap`` until told to stop; returns the exit code of the process."""
+
+    def body(context: ServiceContext) -> None:
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot write to {directory}: {error.strerror or error}") from error
+        _Recorder(context, directory / RECORDING_FILE).serve()
+
+    return run_service("recorder", config, body)
+
+
+class _Recorder:
+    def __init__(self, context: ServiceContext, path: Path) -> None:
+        self._context = context
+        self._path = path
+        self._log = LogState()
+        self._recording = Recording.open(
+            path, chunk_bytes=context.config.recorder.chunk_bytes, on_entry=self._remember_entry
+        )
+        self._views = _ViewThread(context, self._recording)
+        self._failure: OSError | None = None  # of a thread; the main loop ends the service
+        self._refused_images = 0
+        self._pending_keyframes: dict[str, tuple[Keyframe, int, float]] = {}  # id -> record, sequence, time seen
+        self._expected_frames: dict[tuple[str, int], int] = {}  # camera and epoch -> frames that segments list
+        self._held: dict[Stream, Followed[LogRecord]] = {}  # its payloads could not be fetched yet
+
+    def serve(self) -> None:
+        context = self._context
+        threading.Thread(target=self._flush_regularly, name="recorder-flush", daemon=True).start()
+        self._take_up()
+        # Over a link of its own: a slow disk then holds up whoever publishes blocking, and not our own requests.
+        images = context.bus.subscribe(context.bus.keys.all_images(), self._on_image, history=True, isolated=True)
+        followers: dict[Stream, Follower[LogRecord]] = {
+            stream: Follower(context.bus, stream, cls, from_sequence=self._recording.position(stream.value))
+            for stream, cls in RECORD_OF_STREAM.items()
+        }
+        self._views.start()
+        try:
+            next_report = 0.0
+            while not context.stopping.is_set():
+                count = self._follow(followers)
+                self._fill_keyframes()
+                self._check()
+                if time.monotonic() >= next_report:
+                    next_report = time.monotonic() + _REPORT_S
+                    self._report()
+                if count == 0:
+                    context.stopping.wait(_POLL_S)
+            self._follow(followers, keep_going=False)
+        except OSError as error:
+            self._failure = error
+        finally:
+            images.close()
+            for follower in followers.values():
+                follower.close()
+            self._finish()
+
+    def _finish(self) -> None:
+        try:
+            if self._failure is None:
+                self._recording.close()
+        except OSError as error:
+            self._failure = error
+        if self._failure is not None:
+            self._recording.abandon()
+            raise DiskFullError(f"cannot write {self._path}: {self._failure.strerror}") from self._failure
+        self._report("ended")
+
+    # --- what the file says already ---
+
+    def _remember_entry(self, stream: str, _: int, payload: bytes) -> None:
+        cls = RECORD_OF_STREAM.get(Stream(stream))
+        if cls is None:
+            return
+        try:
+            self._log.apply(codec.decode(cls, payload))
+        except CodecError as error:
+            _log.warning("record in the file cannot be read", extra={"stream": stream, "reason": str(error)})
+
+    def _take_up(self) -> None:
+        """What a recorder before this one had not come to."""
+        for sequence, keyframe in enumerate(self._log.keyframes.values()):
+            self._expect_frame(keyframe, sequence)
+        for segment in self._log.segments.values():
+            self._expect_segment(segment)
+        self._views.offer(self._log)
+
+    # --- frames ---
+
+    def _on_image(self, sample: Sample) -> None:
+        camera = sample.key.split("/")[-2]
+        try:
+            image = decode_image(sample.payload, sample.attachment)
+            if image.header is None:
+                self._recording.add_unnumbered_frame(camera, image.encoded, image.media_type, image.capture_time_ns)
+            else:
+                frame_id = FrameId(camera, image.header.epoch, image.header.frame_index)
+                frame = Frame(frame_id.index, image.capture_time_ns, image.encoded, image.media_type)
+                self._recording.add_frame(frame_id, frame)
+        except CodecError as error:
+            self._refused_images += 1
+            if self._refused_images & (self._refused_images - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
+                _log.warning(
+                    "image refused", extra={"key": sample.key, "count": self._refused_images, "reason": str(error)}
+                )
+        except RecordingClosedError:
+            return
+        except OSError as error:
+            self._failure = error
+
+    def _expect_frame(self, keyframe: Keyframe, sequence: int) -> None:
+        if not self._recording.has_frame(keyframe.camera, keyframe.epoch, keyframe.frame_index):
+            self._pending_keyframes[keyframe.keyframe_id] = (keyframe, sequence, time.monotonic())
+
+    def _expect_segment(self, segment: Segment) -> None:
+        listed = self._expected_frames
+        place = (segment.camera, segment.epoch)
+        listed[place] = max(listed.get(place, 0), segment.frames[-1].frame_index + 1 if segment.frames else 0)
+
+    def _fill_keyframes(self) -> None:
+        """Take from the ledger the images of keyframes that did not come over the image key."""
+        for keyframe_id, (keyframe, _, since) in list(self._pending_keyframes.items()):
+            frame_id = FrameId(keyframe.camera, keyframe.epoch, keyframe.frame_index)
+            if not self._recording.has_frame(frame_id.camera, frame_id.epoch, frame_id.index):
+                if time.monotonic() - since < _FRAME_PATIENCE_S:
+                    continue
+                try:
+                    data = self._fetch(keyframe.image)
+                except BusUnavailableError:
+                    return
+                if data is not None and self._recording.is_numbered(keyframe.camera):
+                    frame = Frame(frame_id.index, keyframe.capture_time_ns, data, keyframe.image.media_type)
+                    self._recording.add_frame(frame_id, frame)
+                elif data is not None:
+                    # Which of the unnumbered frames it is cannot be told: its bytes are kept as a payload.
+                    self._recording.add_blob(keyframe.image, data)
+            del self._pending_keyframes[keyframe_id]
+
+    # --- records ---
+
+    def _follow(self, followers: dict[Stream, Follower[LogRecord]], *, keep_going: bool = True) -> int:
+        """Write what has come, a bounded number of records a turn; returns how many."""
+        count = 0
+        for stream, follower in followers.items():
+            for _ in range(_RECORDS_A_TURN):
+                followed = self._held.pop(stream, None) or follower.next(0.0)
+                if followed is None or (keep_going and self._context.stopping.is_set()):
+                    break
+                try:
+                    self._record(followed)
+                except BusUnavailableError:
+                    self._held[stream] = followed
+                    break
+                count += 1
+        return count
+
+    def _record(self, followed: Followed[LogRecord]) -> None:
+        record, stream = followed.record, followed.entry.stream
+        expected = self._recording.position(stream)
+        if followed.sequence > expected:
+            # The follower passes over what it cannot decode; the file keeps it.
+            for entry in self._context.ledger.read(stream, expected, followed.sequence - expected):
+                self._recording.add_entry(entry)
+        if not isinstance(record, Keyframe):
+            for ref in codec.blob_refs(record):
+                if not self._recording.has_blob(ref):
+                    data = self._fetch(ref)
+                    if data is not None:
+                        self._recording.add_blob(ref, data)
+        self._recording.add_entry(followed.entry, self._capture_time_ns(record, followed.entry))
+        self._log.apply(record)
+        match record:
+            case Keyframe():
+                self._expect_frame(record, followed.sequence)
+            case Segment():
+                self._expect_segment(record)
+            case GraphUpdate():
+                self._views.offer(self._log)
+            case _:
+                pass
+
+    def _fetch(self, ref: BlobRef) -> bytes | None:
+        try:
+            return self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)
+        except (RequestRefusedError, LedgerError) as error:
+            _log.error("payload missing in the recording", extra={"sha256": ref.sha256, "reason": str(error)})
+            return None
+
+    def _capture_time_ns(self, record: LogRecord, entry: LogEntry) -> int | None:
+        """The moment of the video that a record speaks of: that of its last keyframe."""
+        match record:
+            case Keyframe():
+                time_ns: int | None = record.capture_time_ns
+            case Segment():
+                time_ns = record.frames[-1].capture_time_ns if record.frames else None
+            case SubmapGeometry():
+                last = self._log.keyframes.get(record.spec.base_keyframe_ids[-1])
+                time_ns = last.capture_time_ns if last is not None else None
+            case _:
+                time_ns = entry.append_time_ns
+        return time_ns if time_ns is not None and time_ns >= 0 else None
+
+    # --- keeping up ---
+
+    def _flush_regularly(self) -> None:
+        while not self._context.stopping.wait(self._context.config.recorder.flush_interval_s):
+            try:
+                self._recording.flush()
+            except OSError as error:
+                self._failure = error
+                return
+
+    def _check(self) -> None:
+        failure = self._failure or self._views.failure
+        if isinstance(failure, OSError):
+            raise failure
+        if failure is not None:
+            raise failure
+
+    def _report(self, state: str = "working") -> None:
+        recording = self._recording
+        pending = len(self._pending_keyframes)
+        missing = sum(self._expected_frames.values()) - recording.frame_count
+        counters: dict[str, float] = {
+            "frames": recording.frame_count,
+            "missing_frames": max(0, missing),
+            "refused_images": self._refused_images,
+            "pending_keyframes": pending,
+        }
+        for stream in RECORD_OF_STREAM:
+            counters[f"position_{stream.value}"] = recording.position(stream.value)
+        # A position stands for everything that follows from the records before it: images, and the final views.
+        if pending:
+            counters["position_keyframe"] = min(sequence for _, sequence, _ in self._pending_keyframes.values())
+        if not self._views.is_done:
+            counters["position_graph"] = max(0, recording.position(Stream.GRAPH.value) - 1)
+        self._context.set_health(state, f"{recording.frame_count} frames in {self._path.name}", **counters)
+
+
+class _ViewThread:
+    """Makes the views beside the recording: of the newest graph only, and at leisure until the graph is final."""
+
+    def __init__(self, context: ServiceContext, recording: Recording) -> None:
+        self._context = context
+        self._recording = recording
+        self._writer = ViewWriter(recording)
+        self._changed = threading.Condition()
+        self._offered: LogState | None = None
+        self._is_busy = False
+        self.failure: OSError | None = None
+
+    def start(self) -> None:
+        threading.Thread(target=self._run, name="recorder-views", daemon=True).start()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether there is nothing to show that is not in the file; live graphs may be passed over."""
+        with self._changed:
+            offered = self._offered.latest_graph() if self._offered is not None else None
+            return not self._is_busy and (offered is None or not offered.is_final)
+
+    def offer(self, log: LogState) -> None:
+        """Ask for views of a log; shallow copies are taken."""
+        if log.latest_graph() is None:
+            return
+        copy = LogState(dict(log.keyframes), dict(log.segments), dict(log.submaps), {}, {}, dict(log.graphs), {})
+        with self._changed:
+            self._offered = copy
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while not self._context.stopping.is_set():
+            with self._changed:
+                if self._offered is None:
+                    self._changed.wait(0.5)
+                    continue
+                log, self._offered = self._offered, None
+                graph = log.latest_graph()
+                is_final = graph is not None and graph.is_final
+                self._is_busy = is_final
+            begin = time.monotonic()
+            try:
+                self._make(log)
+            except RecordingClosedError:
+                return
+            except OSError as error:
+                self.failure = error
+                return
+            except VggtMotionError as error:
+                _log.warning("views not recorded", extra={"reason": str(error)})
+            finally:
+                with self._changed:
+                    self._is_busy = False
+            self._rest(_VIEW_REST * (time.monotonic() - begin))
+
+    def _rest(self, seconds: float) -> None:
+        """Pause, unless the final graph comes."""
+        with self._changed:
+            self._changed.wait_for(self._is_urgent, seconds)
+
+    def _is_urgent(self) -> bool:
+        graph = self._offered.latest_graph() if self._offered is not None else None
+        return self._context.stopping.is_set() or (graph is not None and graph.is_final)
+
+    def _make(self, log: LogState) -> None:
+        graph = log.latest_graph()
+        if graph is None:
+            return
+        backend = self._context.config.backend
+        ids = [(pose.submap_index, pose.submap_revision) for pose in graph.poses]
+        submaps = {index: log.submaps[index, revision] for index, revision in ids if (index, revision) in log.submaps}
+        segments = [log.segments[index] for index in sorted(log.segments)]
+        trajectory = compose(
+            list(log.keyframes.values()), segments, submaps, graph, known_distance_m=backend.known_distance_m
+        )
+        self._writer.add_trajectory(trajectory)
+        if self._writer.wants_map(trajectory):
+            small = backend.model_copy(update={"map_max_points": min(backend.map_max_points, _VIEW_POINTS)})
+            points = build_session_map(log.keyframes, submaps, graph, trajectory, small, self._read_blob)
+            self._writer.add_map(points, trajectory)
+
+    def _read_blob(self, ref: BlobRef) -> bytes:
+        return self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)

@@ -1,0 +1,92 @@
+"""Views for people: poses, trajectory, map and transforms, as Foxglove and Rerun draw them.
+
+The lossless part of a recording needs none of this. A view of the whole (trajectory, map) is written again only when
+the drive has grown by a fixed share, and at the end: so that the views of a long drive cost as much again as the last
+of them, and not its square.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggt_motion import foxglove
+from vggt_motion.backend.map import PointMap
+from vggt_motion.backend.trajectory import Trajectory, TrajectoryPose
+from vggt_motion.recorder.record import MAP_TOPIC, TRAJECTORY_TOPIC, FrameId, Recording
+from vggt_motion.session_map import main_component
+
+_TRAJECTORY_GROWTH = 1.1
+_MAP_GROWTH = 1.5
+
+
+class ViewWriter:
+    """Writes the views of one recording; used from one thread."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Views of a recording; what an earlier process wrote into it is not written again."""
+        self._recording = recording
+        self._trajectory_size = 0
+        self._map_size = 0
+
+    def add_trajectory(self, trajectory: Trajectory) -> None:
+        """Write the poses of new keyframes and, when it has grown enough or is final, the whole trajectory.
+
+        Raises:
+            RecordingClosedError: the recording was closed meanwhile.
+        """
+        posed = [frame for frame in trajectory.keyframes if frame.world_from_camera is not None]
+        for frame in posed:
+            self._add_pose(frame)
+        is_due = len(posed) >= _TRAJECTORY_GROWTH * self._trajectory_size and len(posed) > self._trajectory_size
+        if posed and (is_due or self._is_missing(trajectory, TRAJECTORY_TOPIC)):
+            self._trajectory_size = len(posed)
+            for component in trajectory.components:
+                self._add_part(trajectory, component, [frame for frame in posed if frame.component == component])
+
+    def wants_map(self, trajectory: Trajectory) -> bool:
+        """Whether a map of this trajectory should be made and given to :meth:`add_map`."""
+        size = len(trajectory.keyframes)
+        is_due = size >= _MAP_GROWTH * self._map_size and size > self._map_size
+        return is_due or self._is_missing(trajectory, MAP_TOPIC)
+
+    def add_map(self, points: PointMap, trajectory: Trajectory) -> None:
+        """Write the map.
+
+        Raises:
+            RecordingClosedError: the recording was closed meanwhile.
+        """
+        self._map_size = len(trajectory.keyframes)
+        if len(points.points) == 0:
+            return
+        component = main_component(trajectory)
+        time_ns = _last_time_ns([frame for frame in trajectory.keyframes if frame.component == component])
+        message = foxglove.point_cloud(points.points, points.colors, foxglove.world_frame(component), time_ns)
+        self._recording.add_map(trajectory.graph_revision, message, time_ns)
+
+    def _is_missing(self, trajectory: Trajectory, topic: str) -> bool:
+        return trajectory.is_final and self._recording.view_revision(topic) != trajectory.graph_revision
+
+    def _add_pose(self, frame: TrajectoryPose) -> None:
+        frame_id = FrameId(frame.camera, frame.epoch, frame.frame_index)
+        if frame.world_from_camera is None or self._recording.has_pose(frame_id):
+            return
+        world, time_ns = foxglove.world_frame(frame.component), _time_ns(frame)
+        camera = foxglove.camera_frame(frame.camera)
+        self._recording.add_transform(
+            foxglove.frame_transform(frame.world_from_camera, world, camera, time_ns), time_ns
+        )
+        self._recording.add_pose(frame_id, foxglove.pose_in_frame(frame.world_from_camera, world, time_ns), time_ns)
+
+    def _add_part(self, trajectory: Trajectory, component: int, frames: list[TrajectoryPose]) -> None:
+        poses = [np.asarray(frame.world_from_camera) for frame in frames]
+        time_ns = _last_time_ns(frames)
+        message = foxglove.poses_in_frame(poses, foxglove.world_frame(component), time_ns)
+        self._recording.add_trajectory(trajectory.graph_revision, message, time_ns)
+
+
+def _time_ns(frame: TrajectoryPose) -> int:
+    return max(0, frame.capture_time_ns)
+
+
+def _last_time_ns(frames: list[TrajectoryPose]) -> int:
+    return max((_time_ns(frame) for frame in frames), default=0)
