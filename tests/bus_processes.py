@@ -25,6 +25,7 @@ from vggt_motion.records import Event, EventKind, LogEntry
 _log = logging.getLogger(__name__)
 SESSION = "test"
 READY_S = 20.0
+THIS = Path(__file__)
 
 
 def free_port() -> int:
@@ -49,10 +50,10 @@ def entry(number: int) -> LogEntry:
 class Process:
     """One child; its standard error goes to a file, so that it never blocks."""
 
-    def __init__(self, folder: Path, role: str, endpoint: str, *arguments: str) -> None:
+    def __init__(self, folder: Path, role: str, endpoint: str, *arguments: str, script: Path = THIS) -> None:
         self.log = folder / f"{role}-{time.monotonic_ns()}.log"
         with self.log.open("wb") as file:
-            command = [sys.executable, __file__, role, endpoint, *arguments]
+            command = [sys.executable, str(script), role, endpoint, *arguments]
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file)
 
     def wait(self, timeout_s: float = READY_S) -> int:
@@ -77,8 +78,8 @@ class Process:
 
 
 @contextlib.contextmanager
-def running(folder: Path, role: str, endpoint: str, *arguments: str) -> Iterator[Process]:
-    process = Process(folder, role, endpoint, *arguments)
+def running(folder: Path, role: str, endpoint: str, *arguments: str, script: Path = THIS) -> Iterator[Process]:
+    process = Process(folder, role, endpoint, *arguments, script=script)
     try:
         yield process
     finally:

@@ -124,7 +124,8 @@ class Subscription:
                 key,
                 channel,
                 history=ext.HistoryConfig(detect_late_publishers=True),
-                recovery=ext.RecoveryConfig(periodic_queries=_RECOVERY_INTERVAL, heartbeat=None),
+                # The stub says float, the implementation wants a timedelta.
+                recovery=ext.RecoveryConfig(periodic_queries=_RECOVERY_INTERVAL, heartbeat=None),  # type: ignore[arg-type]
             )
         else:
             self._subscriber = session.declare_subscriber(key, channel)
