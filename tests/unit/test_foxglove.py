@@ -1,0 +1,88 @@
+"""Foxglove messages and what travels on the image key."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from google.protobuf.timestamp_pb2 import Timestamp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vggt_motion import foxglove
+from vggt_motion.bus.images import ImageHeader, decode_image, encode_image
+from vggt_motion.errors import CodecError
+from vggt_motion.sources.source import Frame
+
+TIMES_NS = st.integers(0, 2**63 - 1)
+
+
+@given(st.binary(min_size=1, max_size=200), st.sampled_from(["image/jpeg", "image/png"]), TIMES_NS)
+def test_an_image_comes_back_as_it_went(encoded: bytes, media_type: str, time_ns: int) -> None:
+    payload = foxglove.encode_image(encoded, media_type, time_ns, "front")
+    assert foxglove.decode_image(payload) == (encoded, media_type, time_ns)
+    message = CompressedImage.FromString(payload)  # and any other reader sees the same
+    assert (message.data, message.frame_id) == (encoded, "camera/front")
+    assert message.format == media_type.removeprefix("image/")
+    assert message.timestamp.seconds * 10**9 + message.timestamp.nanos == time_ns
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.booleans(), TIMES_NS)
+def test_the_header_travels_beside_the_image(index: int, epoch: int, is_last: bool, time_ns: int) -> None:
+    header = ImageHeader(epoch, index, is_last)
+    image = decode_image(encode_image(Frame(index, time_ns, b"x", "image/png"), "front"), header.encode())
+    assert image.header == header
+    assert decode_image(encode_image(Frame(index, time_ns, b"x", "image/png"), "front")).header is None
+
+
+@given(st.binary(max_size=300), st.binary(max_size=60))
+@settings(max_examples=1000)
+def test_hostile_bytes_end_as_one_line(payload: bytes, attachment: bytes) -> None:
+    try:
+        image = decode_image(payload, attachment)
+    except CodecError as error:
+        message = str(error)
+        assert message and "\n" not in message
+    else:
+        assert image.encoded and image.capture_time_ns >= 0
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (CompressedImage(data=b"x", format="webp"), "format 'webp' is not read"),
+        (CompressedImage(data=b"x"), "format '' is not read"),
+        (CompressedImage(format="png"), "without image bytes"),
+        (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=-1)), "out of range"),
+        (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=2**40)), "out of range"),
+        (CompressedImage(data=b"x", format="png", timestamp=Timestamp(nanos=-5)), "-5 nanoseconds"),
+        (CompressedImage(data=b"x", format="png", timestamp=Timestamp(nanos=10**9)), "1000000000 nanoseconds"),
+    ],
+)
+def test_impossible_images_are_named(message: CompressedImage, reason: str) -> None:
+    with pytest.raises(CodecError, match=reason):
+        foxglove.decode_image(message.SerializeToString())
+
+
+def test_headers_of_another_schema_and_numbers_too_large_are_refused() -> None:
+    payload = foxglove.encode_image(b"x", "image/png", 0, "front")
+    with pytest.raises(CodecError, match="schema 0"):
+        decode_image(payload, b"\x18\x05")  # a frame index without a schema version
+    with pytest.raises(CodecError, match="schema 2, known is 1"):
+        decode_image(payload, b"\x08\x02")
+    with pytest.raises(CodecError, match="out of range"):
+        decode_image(payload, ImageHeader(0, 2**32).encode())
+
+
+def test_what_cannot_be_recorded_is_refused() -> None:
+    with pytest.raises(CodecError, match="image/webp"):
+        foxglove.encode_image(b"x", "image/webp", 0, "front")
+    for time_ns in (-1, 2**63):
+        with pytest.raises(CodecError, match="not a time"):
+            foxglove.encode_image(b"x", "image/png", time_ns, "front")
+
+
+def test_parts_behind_a_break_have_frames_of_their_own() -> None:
+    names = {foxglove.world_frame(component) for component in (0, 3, 12)}
+    assert names == {"world", "world/3", "world/12"}
+    assert foxglove.point_cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "world", 0)
