@@ -118,7 +118,14 @@ class Partitioner:
     """
 
     def __init__(
-        self, rule: CutRule, overlap_keyframes: int, *, camera: str, epoch: int, ego_mask: BlobRef | None = None
+        self,
+        rule: CutRule,
+        overlap_keyframes: int,
+        *,
+        camera: str,
+        epoch: int,
+        ego_mask: BlobRef | None = None,
+        first_index: int = 0,
     ) -> None:
         """Set up.
 
@@ -128,13 +135,14 @@ class Partitioner:
             camera: name, copied into the segments.
             epoch: copied into the segments.
             ego_mask: copied into the segments.
+            first_index: of the first segment.
         """
         self._rule = rule
         self._overlap_keyframes = overlap_keyframes
         self._camera = camera
         self._epoch = epoch
         self._ego_mask = ego_mask
-        self._index = 0
+        self._index = first_index
         self._base = OpenBase()
         self._overlap: tuple[str, ...] = ()
         self._frames: list[FrameEntry] = []  # of the open segment, up to its last keyframe

@@ -81,6 +81,7 @@ class FrontendPipeline:
         ego_mask: npt.NDArray[np.generic] | None = None,
         ego_mask_ref: BlobRef | None = None,
         *,
+        first_segment: int = 0,
         on_trace: Callable[[FrameTrace], None] | None = None,
     ) -> None:
         """Set up for one stream.
@@ -91,6 +92,7 @@ class FrontendPipeline:
             epoch: part of the keyframe ids.
             ego_mask: (H, W) of the full image, non-zero where pixels belong to the vehicle or an overlay.
             ego_mask_ref: the same mask as a blob, copied into the segments.
+            first_segment: index of the first segment; not 0 for a later epoch of a live camera.
             on_trace: told of each frame once it is decided, in frame order.
         """
         self._config = config
@@ -102,7 +104,12 @@ class FrontendPipeline:
         self._flow = DenseFlow()
         self._smoother = ProfileSmoother(config.smoothing_sigma_frames, config.smoothing_lookahead_frames)
         self._partitioner = Partitioner(
-            create_rule(config), config.overlap_keyframes, camera=camera, epoch=epoch, ego_mask=ego_mask_ref
+            create_rule(config),
+            config.overlap_keyframes,
+            camera=camera,
+            epoch=epoch,
+            ego_mask=ego_mask_ref,
+            first_index=first_segment,
         )
         self._static_flow_px = at_width(config.static_flow_px, config.flow_width_px)
         self._turning_flow_px = at_width(config.turning_flow_px, config.flow_width_px)

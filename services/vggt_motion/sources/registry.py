@@ -27,8 +27,13 @@ class SourceKind:
     opener: str  # "module:function", called with (location: str, selection: Selection)
 
 
+def is_on_bus(location: str) -> bool:
+    """Whether the frames come from the bus already, so that publishing them there would be an echo."""
+    return location.startswith("zenoh:")
+
+
 SOURCE_KINDS: tuple[SourceKind, ...] = (
-    SourceKind("zenoh", lambda location: location.startswith("zenoh:"), "vggt_motion.sources.zenoh:open_zenoh"),
+    SourceKind("zenoh", is_on_bus, "vggt_motion.sources.zenoh:open_zenoh"),
     SourceKind("mcap", lambda location: location.lower().endswith(".mcap"), "vggt_motion.sources.mcap:open_mcap"),
     SourceKind("folder", lambda location: Path(location).is_dir(), "vggt_motion.sources.registry:open_folder"),
     SourceKind("video", lambda _: True, "vggt_motion.sources.registry:open_video"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 @dataclass(frozen=True)
@@ -41,3 +41,23 @@ class Source(Protocol):
     def close(self) -> None:
         """Release files and devices; safe to call twice."""
         ...
+
+
+@runtime_checkable
+class CountsLosses(Protocol):
+    """A live source that says what it could not deliver."""
+
+    dropped_count: int  # frames that arrived and were not taken, because newer ones did
+    missing_count: int  # frames that never arrived, as far as their numbers tell
+    refused_count: int  # messages or pictures that are no readable frame
+
+
+def losses_of(source: Source) -> dict[str, float]:
+    """What a source has lost so far, as counters for the status; empty for a source that loses nothing."""
+    if not isinstance(source, CountsLosses):
+        return {}
+    return {
+        "dropped_frames": source.dropped_count,
+        "missing_frames": source.missing_count,
+        "refused_frames": source.refused_count,
+    }

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from vggt_motion.bus.images import ReceivedImage, decode_image
 from vggt_motion.bus.keys import Keys
 from vggt_motion.bus.session import Sample, open_bus
-from vggt_motion.config import BusConfig, load_config
+from vggt_motion.config import BusConfig, Config, load_config
 from vggt_motion.errors import BusError, CodecError, SourceError
 from vggt_motion.sources.encoded import media_type_of
 from vggt_motion.sources.selection import Selection
@@ -162,7 +162,14 @@ class ZenohSource:
         return True
 
 
-def open_zenoh(location: str, selection: Selection) -> ZenohSource:
-    """Open ``zenoh:CAMERA``; see :func:`vggt_motion.sources.registry.open_source`."""
+def open_zenoh(location: str, selection: Selection, config: Config | None = None) -> ZenohSource:
+    """Open ``zenoh:CAMERA``; see :func:`vggt_motion.sources.registry.open_source`.
+
+    Args:
+        location: without a camera's name the configured one is meant.
+        selection: which of the arriving frames to take.
+        config: where the bus is; None = as the environment says.
+    """
+    settings = load_config() if config is None else config
     camera = location.removeprefix("zenoh:").strip("/")
-    return ZenohSource(load_config().bus, camera or load_config().run.camera, selection)
+    return ZenohSource(settings.bus, camera or settings.run.camera, selection)

@@ -1,0 +1,266 @@
+"""The frontend as a process: frames from a source, keyframes and segments into the ledger (DESIGN sections 3.2 and 4).
+
+Everything that it sends is acknowledged and idempotent. A restarted frontend of a file begins at frame 0 again and
+sends the same records, which the ledger recognises; that of a live camera begins a new epoch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vggt_motion.bus import codec
+from vggt_motion.bus.images import ImageHeader, encode_image
+from vggt_motion.bus.jobs import one_line
+from vggt_motion.bus.pubsub import Publisher
+from vggt_motion.bus.service import ServiceContext, run_service
+from vggt_motion.config import Config
+from vggt_motion.errors import DiskFullError, InputError, RefusalCode, RequestRefusedError, SourceTruncatedError
+from vggt_motion.frontend.pipeline import FrontendPipeline, KeyframeOutput, Output
+from vggt_motion.records import BlobRef, Event, EventKind, MotionState, Stream
+from vggt_motion.sources.encoded import PNG
+from vggt_motion.sources.registry import is_on_bus, open_source
+from vggt_motion.sources.selection import Selection
+from vggt_motion.sources.source import Frame, Source, losses_of
+from vggt_motion.sources.zenoh import open_zenoh
+
+_log = logging.getLogger(__name__)
+
+SESSION_STARTED_ID = "session_started"
+STREAM_ENDED_ID = "stream_ended"
+
+_IMAGE_ENCODING = "application/protobuf;foxglove.CompressedImage"
+_HISTORY_FRAMES = 64  # for a recorder that joins late or loses its link for a moment
+_REPORT_S = 0.2
+_DISK_RETRY_S = 1.0
+
+
+def main(
+    config: Config,
+    *,
+    source: str,
+    start: int = 0,
+    end: int | None = None,
+    stride: int = 1,
+    ego_mask: Path | None = None,
+) -> int:
+    """Run the frontend until its source ends or it is told to stop.
+
+    Returns:
+        Exit code: 0, 2 when no frame is readable, 3 when the source ended early.
+    """
+
+    def body(context: ServiceContext) -> None:
+        # DIS and the decoders gain nothing from threads at these sizes, and the other services need the cores
+        cv2.setNumThreads(1)
+        mask = None if ego_mask is None else EgoMask(ego_mask)
+        opened = _open(config, source, Selection(start, end, stride))
+        with contextlib.closing(opened), _closed_on_stop(opened, context.stopping):
+            _Frontend(context, opened, mask, publishes_frames=not is_on_bus(source)).run()
+
+    return run_service("frontend", config, body)
+
+
+def _open(config: Config, location: str, selection: Selection) -> Source:
+    if is_on_bus(location):
+        # by itself that source would look for the bus in the environment only
+        return open_zenoh(location, selection, config)
+    return open_source(location, start=selection.start, end=selection.end, stride=selection.stride)
+
+
+class EgoMask:
+    """The mask as pixels for the pipeline and as a PNG blob for the log."""
+
+    def __init__(self, path: Path) -> None:
+        """Read an image file.
+
+        Raises:
+            InputError: it is none.
+        """
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"cannot read ego mask {path}: {error.strerror or error}") from error
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
+        if pixels is None:
+            raise InputError(f"ego mask {path} is not a readable image")
+        self.pixels: npt.NDArray[np.uint8] = np.asarray(pixels, np.uint8)  # (H, W), non-zero = never to be used
+        self.png: bytes = cv2.imencode(".png", self.pixels)[1].tobytes()
+        self.ref: BlobRef = codec.blob_ref(self.png, PNG)
+
+
+class _Frontend:
+    """Wires a source and the pure pipeline to the bus."""
+
+    def __init__(
+        self, context: ServiceContext, source: Source, mask: EgoMask | None, *, publishes_frames: bool
+    ) -> None:
+        self._context = context
+        self._source = source
+        self._mask = mask
+        self._camera = context.config.run.camera
+        self._publisher: Publisher | None = None
+        if publishes_frames:
+            self._publisher = context.bus.publisher(
+                context.bus.keys.image(self._camera),
+                blocking=not source.is_live,
+                history=_HISTORY_FRAMES,
+                encoding=_IMAGE_ENCODING,
+            )
+        self._epoch, first_segment = self._take_up() if source.is_live else (0, 0)
+        self._pipeline = FrontendPipeline(
+            context.config.frontend,
+            self._camera,
+            self._epoch,
+            None if mask is None else mask.pixels,
+            None if mask is None else mask.ref,
+            first_segment=first_segment,
+        )
+        self._next_report = 0.0
+
+    def run(self) -> None:
+        """Send everything; raises SourceTruncatedError at the very end when the source ended early."""
+        self._send_started()
+        truncation: SourceTruncatedError | None = None
+        try:
+            for frame in self._source.frames():
+                if self._context.stopping.is_set():
+                    return
+                outputs = self._pipeline.push(frame)
+                self._publish(frame)
+                self._send(outputs)
+                self._report("working")
+        except SourceTruncatedError as error:
+            truncation = error
+        if self._context.stopping.is_set():
+            return  # a live source that we closed, not one that ended
+        self._send(self._pipeline.finish())
+        self._send_ended(truncation)
+        self._report("ended", is_due=True)
+        if truncation is not None:
+            raise truncation
+
+    def _take_up(self) -> tuple[int, int]:
+        """Epoch and first segment index of a live camera: after what an earlier process of it left in the log."""
+        ledger = self._context.ledger
+        epoch = first_segment = 0
+        for stream in (Stream.EVENT, Stream.SEGMENT):
+            position = 0
+            while entries := ledger.read(stream, position, patience_s=self._context.config.bus.connect_timeout_s):
+                position += len(entries)
+                if stream is Stream.EVENT:
+                    epoch += sum(entry.record_id.startswith(SESSION_STARTED_ID) for entry in entries)
+            if stream is Stream.SEGMENT:
+                first_segment = position
+        return epoch, first_segment
+
+    def _send_started(self) -> None:
+        detail = {"source": self._source.description, "fingerprint": self._source.fingerprint}
+        event_id = SESSION_STARTED_ID if self._epoch == 0 else f"{SESSION_STARTED_ID}/{self._epoch}"
+        message = one_line(self._source.description)
+        event = Event(event_id, EventKind.SESSION_STARTED, message, time.time_ns(), detail)
+        try:
+            self._append(Stream.EVENT, event_id, event)
+        except RequestRefusedError as error:
+            # a session that is continued may name its source in another way (a relative path); the fingerprint decides
+            if error.code is not RefusalCode.CONFLICT or not self._is_known_source(event_id):
+                raise
+
+    def _is_known_source(self, event_id: str) -> bool:
+        entries = self._context.ledger.read(Stream.EVENT, 0)
+        known = next((codec.decode(Event, entry.payload) for entry in entries if entry.record_id == event_id), None)
+        if known is None:
+            return False
+        if known.detail.get("fingerprint") != self._source.fingerprint:
+            raise InputError(f"the session holds another source: {known.detail.get('source', 'unknown')}")
+        return True
+
+    def _send_ended(self, truncation: SourceTruncatedError | None) -> None:
+        detail = {
+            "frame_count": str(self._pipeline.frame_count),
+            "segment_count": str(self._pipeline.segment_count),
+        }
+        if truncation is not None:
+            detail["truncated"] = str(truncation)
+        message = one_line(detail.get("truncated", ""))
+        event = Event(STREAM_ENDED_ID, EventKind.STREAM_ENDED, message, time.time_ns(), detail)
+        self._append(Stream.EVENT, STREAM_ENDED_ID, event)
+
+    def _publish(self, frame: Frame) -> None:
+        if self._publisher is not None:
+            self._publisher.put(
+                encode_image(frame, self._camera),
+                timestamp_ns=time.time_ns(),
+                attachment=ImageHeader(self._epoch, frame.index).encode(),
+            )
+
+    def _send(self, outputs: Sequence[Output]) -> None:
+        for output in outputs:
+            if isinstance(output, KeyframeOutput):
+                keyframe = output.keyframe
+                self._append(Stream.KEYFRAME, keyframe.keyframe_id, keyframe, [output.encoded])
+            else:
+                segment = output.segment
+                # the ledger knows the mask from the first segment on; it is small, and a restart must not forget it
+                blobs = [] if self._mask is None else [self._mask.png]
+                self._append(Stream.SEGMENT, segment.record_id, segment, blobs)
+
+    def _append(self, stream: Stream, record_id: str, record: codec.Record, blobs: Sequence[bytes] = ()) -> None:
+        """Append, waiting for ledger, link and space for as long as it takes; nothing is left out."""
+        while True:
+            try:
+                self._context.ledger.append(stream, record_id, record, blobs)
+                return
+            except DiskFullError as error:
+                self._context.set_health("waiting", str(error))
+                if self._context.stopping.wait(_DISK_RETRY_S):
+                    raise
+
+    def _report(self, state: str, *, is_due: bool = False) -> None:
+        now = time.monotonic()
+        if not is_due and now < self._next_report:
+            return
+        self._next_report = now + _REPORT_S
+        pipeline = self._pipeline
+        delay = pipeline.lookahead_frames
+        rate_hz = self._source.frame_rate_hz
+        self._context.set_health(
+            state,
+            self._source.description,
+            frames=pipeline.frame_count,
+            keyframes=pipeline.keyframe_count,
+            segments=pipeline.segment_count,
+            static_frames=pipeline.state_counts[MotionState.STATIC],
+            turning_frames=pipeline.state_counts[MotionState.TURNING],
+            linear_frames=pipeline.state_counts[MotionState.LINEAR],
+            smoothing_delay_frames=delay,
+            **({} if rate_hz is None else {"smoothing_delay_s": delay / rate_hz}),
+            **losses_of(self._source),
+        )
+
+
+@contextlib.contextmanager
+def _closed_on_stop(source: Source, stopping: threading.Event) -> Iterator[None]:
+    """A live source that waits for its next frame is closed when the service is told to stop."""
+    is_over = threading.Event()
+
+    def watch() -> None:
+        while not is_over.is_set():
+            if stopping.wait(_REPORT_S):
+                source.close()
+                return
+
+    if source.is_live:
+        threading.Thread(target=watch, name="stop-watch", daemon=True).start()
+    try:
+        yield
+    finally:
+        is_over.set()
