@@ -32,7 +32,8 @@ _RECORDER_TIMEOUT_S = 30.0
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
 LOG_FOLDER = "logs"
-_IDENTITY_KEY = "run_identity"
+MIN_FRAMES = 2
+TOO_FEW_FRAMES = "the source has only one frame: a trajectory needs at least two"
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,8 @@ class LocalRun:
         self._frame_count = source.frame_count
         fingerprint = source.fingerprint
         source.close()
+        if self._frame_count is not None and self._frame_count < MIN_FRAMES:
+            raise InputError(TOO_FEW_FRAMES)
         if request.ego_mask is not None and not request.ego_mask.is_file():
             raise InputError(f"no ego mask at {request.ego_mask}")
         self.identity = run_identity(request, fingerprint)

@@ -54,7 +54,7 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
         VggtMotionError: a service could not be kept running.
     """
     reference = results.read_ground_truth(ground_truth) if ground_truth is not None else None
-    console = Console(stderr=True, highlight=False)
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
     run = launch.LocalRun(request)
     finished = _claim_folder(request.out, run.identity, fresh=fresh)
     if finished is not None and (reference is None or "ground_truth" in finished):
@@ -69,6 +69,8 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
 
     with _display(console, run.source_description) as on_progress:
         outcome = run.execute(on_progress, finish)
+    if metrics["frame_count"] < launch.MIN_FRAMES and not outcome.interrupted:
+        raise InputError(metrics["truncated"] or launch.TOO_FEW_FRAMES)
     _summarise(console, request.out, metrics)
     if outcome.interrupted:
         console.print("Interrupted. The same command continues from here.")
