@@ -97,7 +97,7 @@ def test_trajectory_draws_unconnected_parts_in_panels_of_their_own() -> None:
     panels = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title(loc="left") for axes in panels] == [f"part from submap {k} (10 frames)" for k in (0, 4, 9)]
     for axes, first in zip(panels, (0, 10, 20), strict=True):
-        np.testing.assert_allclose(axes.lines[0].get_ydata(), np.arange(first, first + 10))
+        np.testing.assert_allclose(axes.lines[0].get_xdata(), np.arange(first, first + 10))  # long ahead: to the right
         assert axes.get_aspect() == 1.0
 
 

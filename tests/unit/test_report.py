@@ -224,7 +224,8 @@ def test_numbers_and_reasons_stand_where_they_belong(page: Page) -> None:
         "pathlength11m",
     ):
         assert phrase in summary.replace(" ", "")
-    assert "ATE RMSE0.123 m" in summary and "drift ATE0.928 %" in summary
+    assert "ATE, RMSE0.123 m" in summary and "drift, ATE / length0.928 %" in summary
+    assert "ate.ate_rmse_m0.1235" in summary
     assert "broken in 1 place:" in summary and "1 job could not be done" in summary
     assert "refused plain" in page.text_of["constraints"]
     assert "1 good, 1 failed; predictor sfm." in page.text_of["submaps"]
@@ -344,3 +345,19 @@ def test_failed_write_keeps_the_report_that_was_there(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
         write_report(tmp_path, empty_data())
     assert (tmp_path / FILE_NAME).read_text(encoding="utf-8") == "earlier"
+
+
+def test_warnings_are_told_once_whoever_tells_them() -> None:
+    data = dataclasses.replace(
+        empty_data(),
+        graph=GraphUpdate(1, True, (), (), ("broken before submap 3",)),
+        events=(Event("w", EventKind.WARNING, "careful", 0),),
+        warnings=("careful", "broken before submap 3", "2 of 9 frames have no pose <b>"),
+        metrics={"warnings": ["careful"], "count": 3},
+    )
+    page = Page(render_report(data))
+    events = page.text_of["events"]
+    assert "Breaks (1)" in events and "Warnings (2)" in events
+    assert events.count("careful") == 1 and events.count("broken before submap 3") == 1
+    assert "2 of 9 frames have no pose <b>" in events
+    assert "All metrics (1)" in page.text_of["summary"]

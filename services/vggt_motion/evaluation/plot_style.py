@@ -102,7 +102,7 @@ class Plan:
 
     def label(self, axes: Any, unit: str) -> None:
         """Name both axes, with their unit."""
-        ahead, right = f"ahead of the first camera, z ({unit})", f"to the right, x ({unit})"
+        ahead, right = f"ahead, z ({unit})", f"to the right, x ({unit})"
         axes.set_xlabel(ahead if self.is_turned else right)
         axes.set_ylabel(right if self.is_turned else ahead)
 

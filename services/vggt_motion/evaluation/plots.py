@@ -85,8 +85,10 @@ def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_
     parts.sort(key=lambda part: part[0])
     dots = dict(keyframes.parts())
     figure = Figure(layout="constrained")
-    columns = min(len(parts), 2) if len(parts) > 1 else 1
-    rows = -(-len(parts) // columns) if parts else 1
+    plan = Plan(is_turned=all(_plan_of(track.positions).is_turned for _, track in parts))
+    columns = 1 if plan.is_turned or len(parts) <= 1 else 2
+    shape = 0.75 if columns == 2 else None  # side by side: panels of one size, however the parts are shaped
+    rows = max(1, -(-len(parts) // columns))
     grid = figure.subplots(rows, columns, squeeze=False)
     width = (WIDTH_IN - 0.8) / columns
     heights = [1.7]
@@ -96,7 +98,6 @@ def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_
             continue
         component, track = parts[place]
         count, positions = len(track), _thinned(track).positions
-        plan = _plan_of(positions) if len(parts) == 1 else Plan(is_turned=False)
         color = PART_COLORS[place % len(PART_COLORS)]
         axes.plot(plan.horizontal(positions), plan.vertical(positions), "-", color=color, lw=2, label="all frames")
         if component in dots:
@@ -105,7 +106,6 @@ def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_
                 plan.horizontal(at), plan.vertical(at), ".", color=color, ms=7, mec="white", mew=0.5, label="keyframes"
             )
         mark_ends(axes, plan, positions, is_labelled=True)
-        shape = None if len(parts) == 1 else 0.75  # panels of one size, however the parts are shaped
         heights.append(panel_inches(_frame_axes(axes, plan, positions, 0.12, shape), width))
         plan.label(axes, length_unit)
         if len(parts) > 1:

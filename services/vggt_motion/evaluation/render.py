@@ -91,7 +91,7 @@ def plan_view(
     row = (z_max - kept[:, 2]) * px_per_unit - 0.5
     # A sparse cloud is drawn with larger dots, until they could cover the picture once.
     wanted_px = np.sqrt(height_px * width_px / max(len(kept), 1))
-    radius = np.full(len(kept), int(np.clip(np.rint((wanted_px - 1.0) / 2.0), 0, 2)), np.int64)
+    radius = np.full(len(kept), int(np.clip(np.rint((wanted_px - 1.0) / 2.0), 0, 1)), np.int64)
     _splat(image, column, row, kept[:, 1], colors[keep], radius)
     return PlanView(image, x_min, x_max, z_min, z_max)
 

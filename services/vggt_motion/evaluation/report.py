@@ -31,18 +31,13 @@ _VERDICTS = {
     SubmapVerdict.ROTATION_ONLY: ("rotation only", "doubtful"),
     SubmapVerdict.FAILED: ("failed", "bad"),
 }
-# Last part of a metric's name -> unit, longest first; "_per_" is left to the name.
-_UNITS = (
-    ("_percent", "%"),
-    ("_degrees", "°"),
-    ("_deg", "°"),
-    ("_bytes", "bytes"),
-    ("_hz", "Hz"),
-    ("_ms", "ms"),
-    ("_px", "px"),
-    ("_m", "m"),
-    ("_s", "s"),
-)
+# What a person looks at first; everything else is in the table.
+_HEADLINES = {
+    "ate_rmse_m": ("ATE, RMSE", "m"),
+    "drift_ate_percent": ("drift, ATE / length", "%"),
+    "t_rel_percent": ("KITTI t_rel", "%"),
+    "wall_seconds": ("wall time", "s"),
+}
 
 
 def write_report(out: Path, data: ReportData) -> Path:
@@ -146,16 +141,8 @@ def _flat(metrics: MetricTree, prefix: str = "") -> Iterable[tuple[str, MetricVa
     for name, value in metrics.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{name}.")
-        else:
+        elif value is None or isinstance(value, float | int | str):
             yield f"{prefix}{name}", value
-
-
-def _unit(name: str) -> tuple[str, str]:
-    """Name without its unit, and the unit: ``ate_rmse_m`` is ("ate rmse", "m")."""
-    for suffix, unit in _UNITS:
-        if name.endswith(suffix):
-            return name.removesuffix(suffix).replace("_", " "), unit
-    return name.replace("_", " "), ""
 
 
 def _metric_cell(value: MetricValue) -> str:
@@ -212,15 +199,13 @@ def _summary(data: ReportData) -> str:
         _card("path length", _number(_path_length(data)), data.length_unit),
     ]
     flat = list(_flat(data.metrics))
+    parts = len(np.unique(data.frames.components))
     for path, value in flat:
         name = path.rpartition(".")[2]
-        if (
-            isinstance(value, float | int)
-            and not isinstance(value, bool)
-            and name.startswith(("ate_rmse", "drift", "wall"))
-        ):
-            label, unit = _unit(name)
-            cards.append(_card(label.replace("ate", "ATE").replace("rmse", "RMSE"), _number(value, 3), unit))
+        if name in _HEADLINES and isinstance(value, float) and math.isfinite(value):
+            label, unit = _HEADLINES[name]
+            note = "largest part only" if unit != "s" and parts > 1 else ""
+            cards.append(_card(label, _number(value, 3), unit, note))
     breaks = data.graph.breaks if data.graph is not None else ()
     if breaks:
         cards.append(_card("breaks", _number(len(breaks))))
@@ -236,8 +221,8 @@ def _summary(data: ReportData) -> str:
     if data.graph is not None and not data.graph.is_final:
         out += _notice("The run was stopped before its final solve: this is the last live estimate.")
     if flat:
-        rows = [[_text(_unit(path)[0]), _metric_cell(value), _text(_unit(path)[1])] for path, value in flat]
-        table = _table(("metric", "value", "unit"), rows, frozenset({1}))
+        rows = [[f"<code>{_text(path)}</code>", _metric_cell(value)] for path, value in flat]
+        table = _table(("metric, as in metrics.json", "value"), rows)
         out += f"<details><summary>All metrics ({len(rows)})</summary>{table}</details>\n"
     return out
 
@@ -257,7 +242,7 @@ def _trajectory(data: ReportData) -> str:
         )
         if parts == 1:
             return out
-    caption = "Seen from above, on the plane of the first camera's x and z axes; both axes have the same scale."
+    caption = "Seen from above, on the plane of the world's x and z axes; both axes have the same scale."
     if parts > 1:
         caption += " Parts that are not connected have no common frame or scale and are drawn apart."
     return out + _figure(
@@ -327,7 +312,7 @@ def _constraints(data: ReportData) -> str:
     )
     refused = [constraint for constraint in ordered if not constraint.accepted]
     if refused:
-        rows = [[_text(_edge_label(c)), _number(c.inlier_ratio, 3), _text(c.reason)] for c in refused]
+        rows = [[_text(_edge_label(c)), f"{c.inlier_ratio:.2f}", _text(c.reason)] for c in refused]
         out += f"<h3>Refused</h3>\n{_table(('edge', 'inlier ratio', 'reason'), rows, frozenset({1}))}"
     return out
 
@@ -417,7 +402,10 @@ def _events(data: ReportData) -> str:
     dead = [event for event in data.events if event.kind == EventKind.JOB_DEAD]
     jobs += [_event_item(event) for event in dead if event.detail.get("job_id") not in known]
     groups.append(("Dead jobs", jobs))
-    groups.append(("Warnings", [_event_item(event) for event in data.events if event.kind == EventKind.WARNING]))
+    warnings = [event for event in data.events if event.kind == EventKind.WARNING]
+    told = {*breaks, *(event.message for event in warnings)}
+    lines = [_event_item(event) for event in warnings] + [_text(line) for line in data.warnings if line not in told]
+    groups.append(("Warnings", lines))
     out = "".join(f"<h3>{title} ({len(items)})</h3>\n{_list(items)}" for title, items in groups if items)
     out = out or _none("None: no warning, no dead job, no break.")
     others = [event for event in data.events if event.kind not in (EventKind.WARNING, EventKind.JOB_DEAD)]

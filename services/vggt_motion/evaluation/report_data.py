@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from vggt_motion.geometry.track import PoseTrack
 from vggt_motion.records import Constraint, Event, GraphUpdate, JobReport, Segment, SubmapGeometry
 
 MetricValue = float | int | str | bool | None
-MetricTree = Mapping[str, "MetricValue | MetricTree"]
+MetricTree = Mapping[str, "MetricValue | Sequence[MetricValue] | MetricTree"]
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,7 @@ class ReportData:
     metrics: MetricTree = field(default_factory=dict)  # as in metrics.json
     stage_seconds: Mapping[str, float] = field(default_factory=dict)  # wall time of the stages of the run
     events: tuple[Event, ...] = ()
+    warnings: tuple[str, ...] = ()  # one line each; what events say already is not said twice
     dead_jobs: tuple[JobReport, ...] = ()
     min_inlier_ratio: float | None = None  # tau_in of the run, drawn as a line
     config_yaml: str = ""
