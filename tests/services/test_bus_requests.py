@@ -148,6 +148,31 @@ def test_closing_a_server_refuses_what_waits_and_frees_the_key(endpoint: str) ->
         assert client.request(key, b"") == b"second"
 
 
+def test_leaving_does_not_wait_for_handlers_that_do_not_end_and_flushes_all_the_same(endpoint: str) -> None:
+    release = threading.Event()
+    got: list[bytes] = []
+    with connect(endpoint) as client, connect(endpoint) as server, ThreadPoolExecutor(6) as pool:
+        client.subscribe(client.keys.all_images(), lambda sample: got.append(sample.payload[:4]))
+        keys = [server.keys.rpc("test", f"wait-{number}") for number in range(6)]
+        for key in keys:
+            server.serve(key, lambda *_: b"late" if release.wait(60) else b"")
+        pending = [pool.submit(client.request, key, b"") for key in keys]
+        publisher = server.publisher(server.keys.image("front"), blocking=True)
+        for _ in range(100):
+            publisher.put(b"test")
+            if got:
+                break
+            time.sleep(0.05)
+        for number in range(20):
+            publisher.put(f"{number:04d}".encode() + bytes(1_000_000))
+        server.close()
+        assert not release.is_set()
+        assert all(isinstance(future.exception(30), BusUnavailableError) for future in pending)
+        release.set()
+        wait_until(lambda: b"0019" in got)
+        assert got[-20:] == [f"{number:04d}".encode() for number in range(20)]
+
+
 def test_interrupt_ends_requests_under_way_and_refuses_new_ones(bus: Bus, endpoint: str, tmp_path: Path) -> None:
     with running(tmp_path, "answer", endpoint):
         echo_when_ready(bus)

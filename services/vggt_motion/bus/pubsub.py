@@ -19,7 +19,7 @@ _FIFO_CAPACITY = 8  # the default of 256 messages would be a gigabyte of images
 _LATEST_CAPACITY = 1
 # Recovery asks the publishers; their heartbeats alone bring nothing back after a restart of the router (Zenoh 1.10).
 _RECOVERY_INTERVAL = timedelta(seconds=1)
-_JOIN_S = 1.0
+_JOIN_S = 0.3
 _NS_PER_S = 1_000_000_000
 MAX_PAYLOAD_BYTES = 768 * 2**20  # Zenoh drops what exceeds 1 GiB without a word
 

@@ -51,8 +51,8 @@ class Server:
         self._thread = threading.Thread(target=self._take_in, name=f"take in {key}", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Take no more queries, refuse those that wait, and give those under way a moment to end."""
+    def begin_close(self) -> None:
+        """Take no more queries and refuse those that wait."""
         if self.is_closed:
             return
         self.is_closed = True
@@ -62,7 +62,11 @@ class Server:
             _log.debug("already undeclared", extra={"key": self._key})
         for _ in range(len(self._workers)):
             self._pending.put(None)
-        deadline = time.monotonic() + _CLOSE_S
+
+    def close(self, wait_s: float = _CLOSE_S) -> None:
+        """End, and give the handlers that are under way a moment to answer."""
+        self.begin_close()
+        deadline = time.monotonic() + wait_s
         for thread in (self._thread, *self._workers):
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))

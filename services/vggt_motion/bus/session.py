@@ -38,6 +38,7 @@ _log = logging.getLogger(__name__)
 _ATTEMPT_S = 1.0
 _RETRY_S = 0.2
 _CLOSE_S = 1.0
+_HANDLERS_S = 0.3
 Kept = TypeVar("Kept", bound=Closable)
 
 
@@ -264,8 +265,16 @@ class Bus:
         self.interrupt()
 
         def leave() -> None:
+            # All at once, then one short wait for all: handlers that do not end must not eat the time for the flush.
+            servers = [closable for closable in closables if isinstance(closable, Server)]
+            for server in servers:
+                server.begin_close()
+            deadline = time.monotonic() + _HANDLERS_S
+            for server in servers:
+                server.close(max(0.0, deadline - time.monotonic()))
             for closable in closables:
-                closable.close()
+                if not isinstance(closable, Server):
+                    closable.close()
             self._session.close()  # type: ignore[no-untyped-call]
 
         thread = threading.Thread(target=leave, name="leave the bus", daemon=True)
