@@ -184,11 +184,37 @@ def _other_size(frame: SharedFrame) -> SharedFrame:
 )
 def test_degenerate_views_are_refused_with_a_reason(damage, words: str) -> None:  # type: ignore[no-untyped-def]
     config = CONFIG.model_copy(update={"min_points": 100})
-    constraint = register(spec_of(), [damage(frame) for frame in overlap()], config)
+    # as a loop: adjacent submaps may still be joined by their cameras
+    constraint = register(spec_of(kind=ConstraintKind.LOOP), [damage(frame) for frame in overlap()], config)
     assert not constraint.accepted
     assert words in constraint.reason and constraint.reason
     assert len(constraint.attempts) >= 2
     assert not any(attempt.outcome == "accepted" for attempt in constraint.attempts)
+
+
+@pytest.mark.parametrize("damage", [_constant_depth, _no_confidence, _nan, _one_row, _other_size])
+def test_cameras_that_agree_join_adjacent_submaps_whose_points_do_not(damage) -> None:  # type: ignore[no-untyped-def]
+    config = CONFIG.model_copy(update={"min_points": 100})
+    constraint = register(spec_of(), [damage(frame) for frame in overlap()], config)
+    assert constraint.accepted
+    assert [attempt.anchor for attempt in constraint.attempts][-1] == "cameras"
+    assert all(attempt.outcome != "accepted" for attempt in constraint.attempts[:-1])
+    assert close(constraint.j_from_i, 1e-6, 1e-6, 1e-6)
+    # they are worth less than points that fit
+    good = register(spec_of(), overlap(), CONFIG)
+    assert np.linalg.eigvalsh(constraint.information).max() < np.linalg.eigvalsh(good.information).max()
+
+
+def test_cameras_that_disagree_join_nothing() -> None:
+    frames = [_nan(frame) for frame in overlap()]
+    rng = np.random.default_rng(0)
+    moved = [
+        spoil(f, submap_from_camera=f.in_j.submap_from_camera @ se3.exp(rng.normal(0, [0.05] * 3 + [0.3] * 3)))
+        for f in frames
+    ]
+    constraint = register(spec_of(), moved, CONFIG)
+    assert not constraint.accepted and "cameras: the submaps disagree" in constraint.reason
+    assert not register(spec_of(2), frames[:2], CONFIG).accepted
 
 
 def test_no_shared_frame_is_refused() -> None:

@@ -7,7 +7,7 @@ attempt is kept.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +18,15 @@ from vggt_motion.errors import RegistrationError
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics, pixel_rays
 from vggt_motion.geometry.sim3 import Sim3
-from vggt_motion.records import Constraint, RegistrationAttempt, RegistrationSpec
-from vggt_motion.registration.sim3 import Sim3Estimate, estimate_sim3
+from vggt_motion.records import Constraint, ConstraintKind, RegistrationAttempt, RegistrationSpec
+from vggt_motion.registration.cameras import align as align_cameras
+from vggt_motion.registration.cameras import fuse, mean_rotation, witnesses
+from vggt_motion.registration.sim3 import (
+    estimate_sim3,
+    require_determined,
+    residual_statistics,
+    with_floor,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +39,15 @@ _MIN_RAY_SPREAD = 0.01
 # Width of the middle 80 % of log-depth; below it the depth map is a constant, as of a predictor that saw nothing.
 _MIN_LOG_DEPTH_SPREAD = 0.02
 # Points and cameras of the same submaps that differ by more contradict each other, as in a mirrored submap.
-_MAX_DISAGREEMENT_RAD = 0.1
+_MAX_DISAGREEMENT_RAD = 0.2
+# Beyond these standard deviations (radians, typical depths, logarithm of scale) a part of the transform is guessed.
+_MAX_SIGMA = np.array([0.02] * 3 + [0.05] * 3 + [0.05])
+# Residual of a camera centre, in baselines, at which it still counts as an inlier when the cameras stand alone.
+_MAX_CAMERA_RESIDUAL = 0.1
+# However well its anchor fits, an edge between two submaps is no better than the submaps are rigid. Standard
+# deviations per axis (radians, typical depths, logarithm of scale) of adjacent edges against ground truth on KITTI
+# 00, 01 and 06.
+_SUBMAP_SIGMA = np.array([0.004] * 3 + [0.015] * 3 + [0.02])
 
 
 @dataclass(frozen=True)
@@ -74,31 +89,31 @@ def register(
         input.
     """
     attempts: list[RegistrationAttempt] = []
-    for name, frames in _ladder(spec, shared, config.anchor):
+    for name, frames, estimate_by in _ladder(spec, shared, config.anchor):
         ids = tuple(frame.keyframe_id for frame in frames)
         try:
-            estimate = _estimate(frames, shared, config, fix_scale=fix_scale)
+            found = estimate_by(frames, shared, config, fix_scale)
         except RegistrationError as error:
             attempts.append(RegistrationAttempt(name, ids, 0, 0.0, float("nan"), str(error)))
             continue
-        outcome = "accepted"
-        if estimate.inlier_ratio < config.min_inlier_ratio:
-            outcome = f"inlier ratio {estimate.inlier_ratio:.2f} is below {config.min_inlier_ratio:.2f}"
+        is_accepted = found.inlier_ratio >= config.min_inlier_ratio
+        outcome = f"inlier ratio {found.inlier_ratio:.2f} is below {config.min_inlier_ratio:.2f}"
         attempts.append(
             RegistrationAttempt(
-                name, ids, estimate.point_count, estimate.inlier_ratio, estimate.median_relative_residual, outcome
+                *(name, ids, found.count, found.inlier_ratio, found.median_relative_residual),
+                "accepted" if is_accepted else outcome,
             )
         )
-        if outcome == "accepted":
+        if is_accepted:
             return Constraint(
                 spec=spec,
                 accepted=True,
                 reason="",
-                j_from_i=estimate.j_from_i,
-                inlier_ratio=estimate.inlier_ratio,
-                median_relative_residual=estimate.median_relative_residual,
-                information=estimate.information,
-                point_count=estimate.point_count,
+                j_from_i=found.j_from_i,
+                inlier_ratio=found.inlier_ratio,
+                median_relative_residual=found.median_relative_residual,
+                information=found.information,
+                point_count=found.count,
                 attempts=tuple(attempts),
             )
     reason = "; ".join(f"{attempt.anchor}: {attempt.outcome}" for attempt in attempts)
@@ -115,27 +130,47 @@ def register(
     )
 
 
+@dataclass(frozen=True)
+class _Found:
+    """What one anchor gives."""
+
+    j_from_i: Sim3
+    information: Array  # (7, 7), floor included
+    inlier_ratio: float
+    median_relative_residual: float
+    count: int  # of points, or of cameras
+
+
+_Estimator = Callable[[Sequence[SharedFrame], Sequence[SharedFrame], RegistrationConfig, bool], _Found]
+
+
 def _ladder(
     spec: RegistrationSpec, shared: Sequence[SharedFrame], first: str
-) -> list[tuple[str, tuple[SharedFrame, ...]]]:
-    """Anchors from the configured one to the whole overlap, each set of frames once."""
+) -> list[tuple[str, tuple[SharedFrame, ...], _Estimator]]:
+    """Anchors from the configured one to the whole overlap, each set of frames once; then the cameras alone.
+
+    The cameras are for adjacent submaps only: there a refusal breaks the trajectory, while a loop can be done without.
+    """
     place = {keyframe_id: position for position, keyframe_id in enumerate(spec.shared_keyframe_ids)}
     middle = len(spec.shared_keyframe_ids) // 2
     # where the middle frame itself is not registered on both sides, the nearest one takes its place
     nearest = sorted(shared, key=lambda frame: (abs(place[frame.keyframe_id] - middle), place[frame.keyframe_id]))
     names = list(_WINDOWS)
-    ladder: list[tuple[str, tuple[SharedFrame, ...]]] = []
+    ladder: list[tuple[str, tuple[SharedFrame, ...], _Estimator]] = []
     for name in names[names.index(first) :]:
         size = _WINDOWS[name]
         chosen = tuple(sorted(nearest[:size], key=lambda frame: place[frame.keyframe_id]))
         if chosen and (not ladder or len(chosen) > len(ladder[-1][1])):
-            ladder.append((name, chosen))
+            ladder.append((name, chosen, _by_points))
+    if ladder and spec.kind is ConstraintKind.ADJACENT:
+        ladder.append(("cameras", tuple(shared), _by_cameras))
     return ladder
 
 
-def _estimate(
-    frames: Sequence[SharedFrame], shared: Sequence[SharedFrame], config: RegistrationConfig, *, fix_scale: bool
-) -> Sim3Estimate:
+def _by_points(
+    frames: Sequence[SharedFrame], shared: Sequence[SharedFrame], config: RegistrationConfig, fix_scale: bool
+) -> _Found:
+    """Align by the point maps of the anchor, with all shared cameras as witnesses."""
     # 1. pixels that both sides trust
     masks = [_valid_pixels(frame, config) for frame in frames]
     if sum(int(mask.sum()) for mask in masks) < config.min_points:
@@ -146,7 +181,8 @@ def _estimate(
     _check_view(depth_i, depth_j, np.concatenate([rays_j for _, rays_j in rays]), shared)
     # 2. a robust start: rotation of the shared cameras, median depth ratio
     scale = 1.0 if fix_scale else float(np.median(depth_j / depth_i))
-    rotation = camera_rotation(shared)
+    in_i, in_j = ([getattr(f, side).submap_from_camera for f in shared] for side in ("in_i", "in_j"))
+    rotation = mean_rotation(np.array(in_i), np.array(in_j))
     start = _start(frames, rotation, scale)
     # 3. the same pixel is the same point
     points_i, points_j = (
@@ -158,8 +194,8 @@ def _estimate(
         )
         for side, views in enumerate(([f.in_i for f in frames], [f.in_j for f in frames]))
     )
-    # Both depths err; dividing by one of them would favour the points that this side happens to see too near, and
-    # pull the scale by the variance of the noise, at every edge in the same direction.
+    # Both depths err; dividing by one of them would favour the points that this side happens to see too near, and pull
+    # the scale by the variance of the noise, at every edge in the same direction.
     depth = np.sqrt(scale * depth_i.astype(np.float64) * depth_j)
     weights = np.ones(len(depth), dtype=np.float32)
     estimate = estimate_sim3(
@@ -169,7 +205,27 @@ def _estimate(
     turned = float(np.linalg.norm(se3.so3_log(estimate.j_from_i.rotation @ rotation.T)))
     if turned > _MAX_DISAGREEMENT_RAD:
         raise RegistrationError(f"points and cameras disagree by {np.degrees(turned):.0f} degrees")
-    return estimate
+    cameras = witnesses(in_i, in_j, estimate.typical_depth)
+    fused, information = fuse(estimate.j_from_i, estimate.information, cameras, fix_scale=fix_scale)
+    require_determined(information, estimate.centre, estimate.typical_depth, _MAX_SIGMA, fix_scale=fix_scale)
+    inlier_ratio, median = residual_statistics(points_i, points_j, depth, fused, config)
+    information = with_floor(information, estimate.centre, estimate.typical_depth, _SUBMAP_SIGMA, fix_scale=fix_scale)
+    return _Found(fused, information, inlier_ratio, median, estimate.point_count)
+
+
+def _by_cameras(
+    frames: Sequence[SharedFrame], _shared: Sequence[SharedFrame], _config: RegistrationConfig, fix_scale: bool
+) -> _Found:
+    """Align by the shared cameras alone, where the submaps agree on them although they do not on the points."""
+    in_i, in_j = ([getattr(f, side).submap_from_camera for f in frames] for side in ("in_i", "in_j"))
+    transform, information = align_cameras(in_i, in_j, fix_scale=fix_scale)
+    centres_i, centres_j = (np.array([pose[:3, 3] for pose in poses]) for poses in (in_i, in_j))
+    middle = centres_j.mean(axis=0)
+    baseline = float(np.linalg.norm(centres_j - middle, axis=1).max())
+    relative = np.linalg.norm(transform.act(centres_i) - centres_j, axis=1) / baseline
+    information = with_floor(information, middle, baseline, 2.0 * _SUBMAP_SIGMA, fix_scale=fix_scale)
+    inlier_ratio = float(np.mean(relative <= _MAX_CAMERA_RESIDUAL))
+    return _Found(transform, information, inlier_ratio, float(np.median(relative)), len(frames))
 
 
 def _valid_pixels(frame: SharedFrame, config: RegistrationConfig) -> npt.NDArray[np.bool_]:
@@ -226,14 +282,6 @@ def _check_view(
                 raise RegistrationError(
                     "all points are far: the cameras of the overlap hardly move against their depth"
                 )
-
-
-def camera_rotation(shared: Sequence[SharedFrame]) -> Array:
-    """Rotation (3, 3) of ``j_from_i`` from the cameras of all shared frames: their chordal mean."""
-    total = np.zeros((3, 3))
-    for frame in shared:
-        total += frame.in_j.submap_from_camera[:3, :3] @ frame.in_i.submap_from_camera[:3, :3].T
-    return se3.nearest_rotation(total)
 
 
 def _start(frames: Sequence[SharedFrame], rotation: Array, scale: float) -> Sim3:

@@ -25,10 +25,15 @@ _CONVERGED = 1e-7
 _MEDIAN_OF_NORM = 1.5382
 # Float16 depth on the wire is worth 5e-4; no estimate may claim to be better than about that.
 _SIGMA_FLOOR = 5e-4
-# Neighbouring pixels err together: an anchor image is worth about this many independent points.
-_INDEPENDENT_POINTS_PER_FRAME = 50.0
-# Beyond these standard deviations (radians, of the typical depth, of the logarithm) a part of the transform is guessed.
-_MAX_SIGMA_ROTATION, _MAX_SIGMA_TRANSLATION, _MAX_SIGMA_LOG_SCALE = 0.02, 0.05, 0.05
+# Neighbouring pixels err together: an anchor image is worth about this many independent points. Measured on KITTI,
+# where points against cameras weigh best so (see cameras.py).
+_INDEPENDENT_POINTS_PER_FRAME = 500.0
+# Beyond these standard deviations (radians, typical depths, logarithm of scale) the points do not determine a
+# transform.
+MAX_SIGMA = np.array([0.05] * 3 + [0.1] * 3 + [0.1])
+# Below this ratio of the extreme eigenvalues of the normal equations, all parts in one unit, something is not seen at
+# all.
+_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,8 @@ class Sim3Estimate:
     inlier_ratio: float  # share of the valid points within ``inlier_relative``
     median_relative_residual: float
     information: Array  # (7, 7): rotation, translation, log-scale; left perturbation exp(xi) @ j_from_i, frame j
+    centre: Array  # (3,) middle of the points, frame j
+    typical_depth: float  # median depth, units of frame j
     point_count: int  # valid points
     iterations: int
 
@@ -95,16 +102,29 @@ def estimate_sim3(
     sigma = max(median / _MEDIAN_OF_NORM, _SIGMA_FLOOR)
     independent = min(_INDEPENDENT_POINTS_PER_FRAME * frame_count, len(x)) / len(x)
     normal = _normal_equations(sums / float(w.mean(dtype=np.float64))) * independent / sigma**2
-    _check_determined(normal, typical, fix_scale=fix_scale)
-    to_centre = Sim3(np.eye(3), -centre, 1.0).adjoint()
+    require_determined(about(normal, -centre), centre, typical, MAX_SIGMA, fix_scale=fix_scale)
     return Sim3Estimate(
         current,
         float(np.mean(residuals <= config.inlier_relative)),
         median,
-        to_centre.T @ normal @ to_centre,
+        about(normal, -centre),
+        centre,
+        typical,
         len(x),
         iterations,
     )
+
+
+def residual_statistics(
+    points_i: npt.NDArray[np.floating],
+    points_j: npt.NDArray[np.floating],
+    depth_j: npt.NDArray[np.floating],
+    j_from_i: Sim3,
+    config: RegistrationConfig,
+) -> tuple[float, float]:
+    """Inlier ratio and median depth-relative residual of valid points under any transform."""
+    relative = np.linalg.norm(j_from_i.act(points_i) - points_j, axis=1) / depth_j
+    return float(np.mean(relative <= config.inlier_relative)), float(np.median(relative))
 
 
 def _valid(
@@ -178,18 +198,65 @@ def _normal_equations(sums: Array) -> Array:
     return out
 
 
-def _check_determined(normal: Array, typical_depth: float, *, fix_scale: bool) -> None:
-    """Refuse a transform of which some part has no support in the points."""
+def uncertainty(information: Array, centre: Array, typical_depth: float, *, fix_scale: bool) -> Array:
+    """Standard deviations (7,) of rotation (rad), translation (typical depths) and log-scale about a point of frame j.
+
+    Args:
+        information: (7, 7) of a left perturbation in frame j.
+        centre: (3,) point about which the parts are told apart, the middle of the points.
+        typical_depth: unit of the translation.
+        fix_scale: the log-scale is known.
+
+    Raises:
+        RegistrationError: some part is not determined at all.
+    """
+    covariance = _covariance(about(information, centre), typical_depth, fix_scale=fix_scale)
+    return np.sqrt(np.diag(covariance))
+
+
+def require_determined(
+    information: Array, centre: Array, typical_depth: float, limit: Array, *, fix_scale: bool
+) -> None:
+    """Refuse a transform of which some part is guessed; arguments as of :func:`uncertainty`, ``limit`` in its units.
+
+    Raises:
+        RegistrationError: names the part.
+    """
+    sigma = uncertainty(information, centre, typical_depth, fix_scale=fix_scale)
+    worst = int(np.argmax(sigma / limit))
+    if sigma[worst] > limit[worst]:
+        part = ("rotation", "translation", "scale")[worst // 3]
+        amount = f"{np.degrees(sigma[worst]):.1f} degrees" if worst < 3 else f"{100 * sigma[worst]:.0f} %"
+        raise RegistrationError(f"the {part} is uncertain by {amount}")
+
+
+def with_floor(information: Array, centre: Array, typical_depth: float, floor: Array, *, fix_scale: bool) -> Array:
+    """The information (7, 7) after independent errors of standard deviations ``floor`` (7,) are added.
+
+    Arguments as of :func:`uncertainty`; the floor is in its units, about its centre.
+    """
+    covariance = _covariance(about(information, centre), typical_depth, fix_scale=fix_scale) + np.diag(floor**2)
+    unit = _units(typical_depth)
+    return about(np.linalg.inv(covariance) / np.outer(unit, unit), -centre)
+
+
+def about(information: Array, centre: Array) -> Array:
+    """Information (7, 7) of the perturbation about ``centre`` instead of about the origin of the frame."""
+    to_origin = Sim3(np.eye(3), centre, 1.0).adjoint()
+    return np.asarray(to_origin.T @ information @ to_origin, dtype=np.float64)
+
+
+def _units(typical_depth: float) -> Array:
+    return np.array([1.0] * 3 + [typical_depth] * 3 + [1.0])
+
+
+def _covariance(centred: Array, typical_depth: float, *, fix_scale: bool) -> Array:
     size = 6 if fix_scale else 7
-    unit = np.array([1.0] * 3 + [typical_depth] * 3 + [1.0])[:size]
-    scaled = normal[:size, :size] * np.outer(unit, unit)
+    unit = _units(typical_depth)
+    scaled = (centred * np.outer(unit, unit))[:size, :size]
     eigenvalues, vectors = np.linalg.eigh(scaled)
-    if not np.isfinite(eigenvalues).all() or eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
+    if not np.isfinite(eigenvalues).all() or eigenvalues[0] <= _SINGULAR * eigenvalues[-1]:
         raise RegistrationError("the points do not determine the transform")
-    sigmas = np.sqrt(np.einsum("ik,k->i", vectors**2, 1.0 / eigenvalues))
-    if float(sigmas[:3].max()) > _MAX_SIGMA_ROTATION:
-        raise RegistrationError(f"the rotation is uncertain by {np.degrees(sigmas[:3].max()):.1f} degrees")
-    if float(sigmas[3:6].max()) > _MAX_SIGMA_TRANSLATION:
-        raise RegistrationError(f"the translation is uncertain by {100 * sigmas[3:6].max():.0f} % of the depth")
-    if not fix_scale and float(sigmas[6]) > _MAX_SIGMA_LOG_SCALE:
-        raise RegistrationError(f"the scale is uncertain by {100 * sigmas[6]:.0f} %")
+    out = np.zeros((7, 7))
+    out[:size, :size] = (vectors / eigenvalues) @ vectors.T
+    return out
