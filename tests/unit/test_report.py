@@ -361,3 +361,18 @@ def test_warnings_are_told_once_whoever_tells_them() -> None:
     assert events.count("careful") == 1 and events.count("broken before submap 3") == 1
     assert "2 of 9 frames have no pose <b>" in events
     assert "All metrics (1)" in page.text_of["summary"]
+
+
+def test_page_of_a_very_long_drive_stays_small() -> None:
+    count = 60_000
+    entries = tuple(FrameEntry(i, i * 100_000_000, MotionState("LT"[i // 40 % 2]), i % 3 == 0) for i in range(count))
+    base = tuple(keyframe(entry.frame_index) for entry in entries if entry.is_keyframe)
+    frames = track(count)
+    frames.track.world_from_camera[:, 0, 3] = np.random.default_rng(1).normal(0.0, 1.0, count)
+    data = dataclasses.replace(
+        empty_data(), segments=(Segment(0, "front", 0, base, (), entries, "budget"),), frames=frames, keyframes=frames
+    )
+    text = render_report(data)
+    assert len(text) < 4_000_000
+    sources = Page(text).attributes("img", "src")
+    assert any(source.startswith("data:image/png") for source in sources)

@@ -24,6 +24,7 @@ from vggt_motion.records import Constraint, Event, EventKind, JobReport, Segment
 FILE_NAME = "report.html"
 
 _UNKNOWN = "\N{EN DASH}"
+_MAX_SVG_BYTES = 1_000_000  # drawn finer than a screen shows: pixels are smaller then
 _MAX_ROWS = 200  # of any table or list: a page must open, however long the drive was
 _VERDICTS = {
     SubmapVerdict.GOOD: ("good", "good"),
@@ -103,10 +104,9 @@ def _number(value: float, digits: int = 4) -> str:
 
 
 def _figure(figure: Figure, name: str, alternative: str, caption: str = "", is_photo: bool = False) -> str:
-    if is_photo:
+    media, payload = "image/svg+xml", b"" if is_photo else to_svg(figure)
+    if is_photo or len(payload) > _MAX_SVG_BYTES:
         media, payload = "image/png", to_png(figure, 125)
-    else:
-        media, payload = "image/svg+xml", to_svg(figure)
     width_px = round(float(figure.get_size_inches()[0]) * 105)
     encoded = base64.b64encode(payload).decode("ascii")
     note = f"<figcaption>{_text(caption)}</figcaption>" if caption else ""
