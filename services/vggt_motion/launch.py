@@ -20,8 +20,10 @@ from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus, open_bus
 from vggt_motion.config import BusConfig, Config
 from vggt_motion.errors import BusError, InputError, VggtMotionError
+from vggt_motion.ledger.sessions import SessionIdentity
 from vggt_motion.records import HealthReport, MotionState
 from vggt_motion.sources.registry import open_source
+from vggt_motion.sources.source import Source
 from vggt_motion.supervise import ServiceCommand, Supervisor
 
 _log = logging.getLogger(__name__)
@@ -32,6 +34,7 @@ _RECORDER_TIMEOUT_S = 30.0
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
 LOG_FOLDER = "logs"
+_METHOD_SECTIONS = ("frontend", "inference", "registration", "loops", "backend")
 MIN_FRAMES = 2
 TOO_FEW_FRAMES = "the source has only one frame: a trajectory needs at least two"
 
@@ -77,21 +80,18 @@ class RunOutcome:
     restart_count: int
 
 
-def run_identity(request: RunRequest, fingerprint: str) -> str:
+def session_identity(request: RunRequest, source: Source) -> SessionIdentity:
     """What makes two runs the same one: the input, the part of it, and everything that decides the result."""
     config = request.config
     mask = hashlib.sha256(request.ego_mask.read_bytes()).hexdigest() if request.ego_mask is not None else None
-    identity = {
-        "source": fingerprint,
+    method = {
         "selection": [request.start, request.end, request.stride],
         "ego_mask": mask,
         "camera": config.run.camera,
-        "method": {
-            name: getattr(config, name).model_dump(mode="json")
-            for name in ("frontend", "inference", "registration", "loops", "backend")
-        },
+        **{name: getattr(config, name).model_dump(mode="json") for name in _METHOD_SECTIONS},
     }
-    return json.dumps(identity, sort_keys=True)
+    digest = hashlib.sha256(json.dumps(method, sort_keys=True).encode()).hexdigest()
+    return SessionIdentity(source.description, source.fingerprint, digest)
 
 
 def free_port(host: str = "127.0.0.1") -> int:
@@ -168,13 +168,12 @@ class LocalRun:
         source = open_source(request.source, start=request.start, end=request.end, stride=request.stride)
         self.source_description = source.description
         self._frame_count = source.frame_count
-        fingerprint = source.fingerprint
         source.close()
         if self._frame_count is not None and self._frame_count < MIN_FRAMES:
             raise InputError(TOO_FEW_FRAMES)
         if request.ego_mask is not None and not request.ego_mask.is_file():
             raise InputError(f"no ego mask at {request.ego_mask}")
-        self.identity = run_identity(request, fingerprint)
+        self.identity = session_identity(request, source)
         check_port(request.config.gateway.host, request.config.gateway.port)
         config = with_free_endpoint(request.config)
         self._request = replace(request, config=config)

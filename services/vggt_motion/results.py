@@ -132,6 +132,7 @@ def write_results(
         cloud=None if cloud is None else PointCloud(cloud.points, cloud.colors, component),
         camera_view=_camera_view(state, trajectory, component, load_blob),
         metrics=metrics,
+        warnings=tuple(metrics["warnings"]),
         stage_seconds=_stage_seconds(state, facts),
         events=tuple(state.events.values()),
         dead_jobs=facts.dead_jobs,

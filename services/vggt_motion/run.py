@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,12 +20,11 @@ from vggt_motion.bus.session import Bus
 from vggt_motion.errors import InputError, SourceTruncatedError
 from vggt_motion.geometry.track import PoseTrack
 from vggt_motion.ledger.directory import locked
-from vggt_motion.records import JobState, MotionState
+from vggt_motion.ledger.sessions import SessionState, prepare_session, remove_session
+from vggt_motion.records import Event, EventKind, JobState, MotionState, Stream
 
 INTERRUPTED_EXIT_CODE = 130
-_IDENTITY_FILE = "run.json"
 _FILES = (
-    _IDENTITY_FILE,
     results.METRICS_FILE,
     launch.CONFIG_FILE,
     "trajectory_keyframes.tum",
@@ -56,7 +55,7 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     reference = results.read_ground_truth(ground_truth) if ground_truth is not None else None
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     run = launch.LocalRun(request)
-    finished = _claim_folder(request.out, run.identity, fresh=fresh)
+    finished = _claim_folder(request, run, fresh=fresh)
     if finished is not None and (reference is None or "ground_truth" in finished):
         console.print(f"This run is finished already (in {request.out}); --fresh runs it again.")
         _summarise(console, request.out, finished)
@@ -66,6 +65,9 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
 
     def finish(outcome: launch.RunOutcome, bus: Bus) -> None:
         metrics.update(_write_results(request, run, outcome, bus, reference))
+        if metrics["is_complete"]:
+            event = Event("run_ended", EventKind.RUN_ENDED, "the run ended by itself", time.time_ns())
+            LedgerClient(bus).append(Stream.EVENT, event.event_id, event)
 
     with _display(console, run.source_description) as on_progress:
         outcome = run.execute(on_progress, finish)
@@ -80,52 +82,30 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     return outcome.exit_code
 
 
-def _claim_folder(out: Path, identity: str, *, fresh: bool) -> dict[str, Any] | None:
+def _claim_folder(request: launch.RunRequest, run: launch.LocalRun, *, fresh: bool) -> dict[str, Any] | None:
     """Make the folder this run's; the metrics of the run where it is finished already.
 
     Raises:
-        InputError: the folder cannot be written, is in use, or holds another run.
+        InputError: the folder cannot be written, or holds another run.
+        LedgerError: the folder is in use, or its ledger is damaged.
     """
-    identity_file, metrics_file = out / _IDENTITY_FILE, out / results.METRICS_FILE
-    ledger = out / launch.LEDGER_FOLDER
+    ledger, metrics_file = request.out / launch.LEDGER_FOLDER, request.out / results.METRICS_FILE
     try:
-        ledger.mkdir(parents=True, exist_ok=True)
+        if fresh:
+            remove_session(ledger)
+            for name in _FILES:
+                (request.out / name).unlink(missing_ok=True)
+        state = prepare_session(ledger, run.identity)
         with locked(ledger):
-            if fresh:
-                shutil.rmtree(ledger / "blobs", ignore_errors=True)
-                for path in [*ledger.glob("ledger.db*"), *(out / name for name in _FILES)]:
-                    path.unlink(missing_ok=True)
-            known = identity_file.read_text(encoding="utf-8") if identity_file.exists() else None
-            if known is not None and known != identity:
-                raise InputError(
-                    f"{out} holds a run of another source or configuration ({_difference(known, identity)}): "
-                    "choose another --out, or discard it with --fresh"
-                )
-            if known is None:
-                identity_file.write_text(identity, encoding="utf-8")
-            if not metrics_file.exists():
-                return None
-            metrics: dict[str, Any] = json.loads(metrics_file.read_text(encoding="utf-8"))
-            return metrics if metrics.get("is_complete") else None
+            pass  # in use by another run: said now, in one line
+        if state is not SessionState.FINISHED or not metrics_file.exists():
+            return None
+        metrics: dict[str, Any] = json.loads(metrics_file.read_text(encoding="utf-8"))
+        return metrics
     except OSError as error:
-        raise InputError(f"cannot write to {out}: {error.strerror or error}") from error
+        raise InputError(f"cannot write to {request.out}: {error.strerror or error}") from error
     except ValueError as error:
-        raise InputError(f"{out} holds a damaged run ({error}): discard it with --fresh") from error
-
-
-def _difference(known: str, identity: str) -> str:
-    """Names of the parts in which two identities differ."""
-
-    def flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-        if isinstance(value, dict):
-            for name, item in value.items():
-                yield from flat(item, f"{prefix}.{name}" if prefix else name)
-        else:
-            yield prefix, value
-
-    ours, theirs = dict(flat(json.loads(identity), "")), dict(flat(json.loads(known), ""))
-    names = sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name))
-    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
+        raise InputError(f"{metrics_file} is damaged ({error}): discard the run with --fresh") from error
 
 
 def _write_results(

@@ -154,7 +154,7 @@ def test_a_finished_run_prints_its_summary_again(finished: tuple[Path, Any], sam
 def test_a_folder_of_another_run_is_refused(finished: tuple[Path, Any], sample: Path) -> None:
     out, _ = finished
     done = run(sample, out, "--stride", "2")
-    assert_one_clear_line(done, 2, str(out), "selection", "--fresh")
+    assert_one_clear_line(done, 2, str(out), "another configuration", "--fresh")
 
 
 def test_ctrl_c_keeps_what_was_done_and_the_next_run_continues(
