@@ -1,34 +1,37 @@
-"""Dense depth of keyframes with known cameras: a plane sweep over inverse depth, checked between frames.
+"""Dense depth of keyframes with known cameras, and how far it can be trusted.
 
-Every hypothesis is a plane parallel to the image; with camera ``s`` at ``[R | t]`` from the reference, the pixel with
-ray ``r`` and inverse depth ``d`` is seen at the direction ``R r + d t``, so that a sweep costs one scaled addition per
-pixel and stays exact next to the epipole of a forward motion, where rectification breaks down.
+Each frame is matched with a few neighbours; what its neighbours found for the same surface confirms it. The
+confidence follows from the expected relative error of depth: how far the match travels in the image as depth changes
+(nothing in the sky and at the epipole, by itself), how well it correlates, and how many neighbours agree.
 """
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from vggt_motion.geometry import se3
-from vggt_motion.geometry.projection import Intrinsics, pixel_rays, project
+from vggt_motion.geometry.projection import Intrinsics, pixel_rays
+from vggt_motion.inference.sfm import stereo
 from vggt_motion.inference.sfm.images import GreyImage
 
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_HYPOTHESES = 64
-_WINDOW_PX = 5
 _MAX_NEIGHBOURS = 4
-_TEXTURE_VARIANCE = 4.0  # grey levels squared: below it a window has no texture to match
-_MATCH_SIGMA_PX = 0.25  # standard deviation of a good match at the depth lattice
-_GOOD_RELATIVE_SIGMA = 0.05  # relative depth error at which confidence is one half
-_CONSISTENT_RELATIVE = 0.05  # relative inverse depth difference of two frames that agree
+_REACH = 6  # keyframes to either side that are considered as neighbours
+_BEST_PARALLAX_PX = 8.0  # at the lattice: enough to see depth, little enough to look alike
+_PARALLAX_LOG_WIDTH = 0.9
+_MIN_HYPOTHESES, _MAX_HYPOTHESES = 24, 80
+_MATCH_SIGMA_PX = 0.2  # of a good match at the lattice
+_HALF_RELATIVE_SIGMA = 0.04  # expected relative error at which confidence is one half
+_AGREEING_RELATIVE = 0.03  # depths of two frames that agree differ at most by so much and twice their expected error
+_LOW_CORRELATION, _HIGH_CORRELATION = 0.5, 0.9
 
 
 @dataclass(frozen=True)
@@ -40,16 +43,16 @@ class DepthMap:
 
 
 @dataclass(frozen=True)
-class _Sweep:
-    inverse_depth: Map  # (H, W), 0 where unknown
-    score: Map  # (H, W) mean correlation of the chosen hypothesis
-    relative_sigma: Map  # (H, W)
+class SparseDepth:
+    """What the structure knows of a frame: points (N, 3) in its camera frame, submap units."""
+
+    points_camera: Array
 
 
 def dense_depth(
     grey: Mapping[int, GreyImage],
     camera_from_submap: Mapping[int, Array],
-    nearest_inverse_depth: Mapping[int, float],
+    sparse: Mapping[int, SparseDepth],
     intrinsics: Intrinsics,
     usable: npt.NDArray[np.bool_],
 ) -> dict[int, DepthMap]:
@@ -58,141 +61,161 @@ def dense_depth(
     Args:
         grey: position -> image (H, W) at the lattice of ``intrinsics``.
         camera_from_submap: position -> (4, 4) pose, the same keys.
-        nearest_inverse_depth: position -> largest inverse depth worth looking at, in submap units.
+        sparse: position -> the points that it sees, the same keys.
         intrinsics: of the lattice.
         usable: (H, W), False on pixels never to be used.
     """
     positions = sorted(grey)
-    rays = pixel_rays(intrinsics)
     images = {position: grey[position].astype(np.float32) for position in positions}
-    neighbours = {position: _neighbours(position, positions, camera_from_submap) for position in positions}
-    sweeps = {
-        position: _sweep(
-            images[position],
-            [images[other] for other in neighbours[position]],
-            [camera_from_submap[other] @ se3.inverse(camera_from_submap[position]) for other in neighbours[position]],
-            nearest_inverse_depth[position],
-            intrinsics,
-            rays,
-            usable,
-        )
-        for position in positions
-    }
-    return {
-        position: _confidence(position, sweeps, neighbours[position], camera_from_submap, intrinsics, rays, usable)
-        for position in positions
-    }
+    nearest = _nearest_inverse_depths(sparse)
+    matched: dict[int, stereo.Stereo] = {}
+    neighbours: dict[int, list[int]] = {}
+    for position in positions:
+        neighbours[position] = _neighbours(position, positions, camera_from_submap, sparse[position], intrinsics)
+        if not neighbours[position]:
+            continue
+        views = [
+            stereo.View(images[other], camera_from_submap[other] @ se3.inverse(camera_from_submap[position]))
+            for other in neighbours[position]
+        ]
+        count = _hypotheses(views, sparse[position], intrinsics, nearest[position])
+        matched[position] = stereo.match(images[position], views, intrinsics, nearest[position], count)
+    sigma = {position: _relative_sigma(matched[position]) for position in matched}
+    rays = pixel_rays(intrinsics)
+    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1])
+    nothing = np.zeros(usable.shape, dtype=np.float32)
+    maps = {}
+    for position in positions:
+        if position not in matched:
+            maps[position] = DepthMap(nothing, nothing)
+            continue
+        others = [other for other in neighbours[position] if other in matched]
+        confirmed = np.zeros(usable.shape, dtype=np.float32)
+        for other in others:
+            other_from_this = camera_from_submap[other] @ se3.inverse(camera_from_submap[position])
+            confirmed += agreement(
+                matched[position].inverse_depth, sigma[position], matched[other].inverse_depth, sigma[other],
+                other_from_this, rays, camera,
+                _AGREEING_RELATIVE,
+            )  # fmt: skip
+        maps[position] = _judged(matched[position], sigma[position], confirmed, len(others), usable)
+    return maps
 
 
-def _neighbours(position: int, positions: Sequence[int], camera_from_submap: Mapping[int, Array]) -> list[int]:
-    """Frames to match with: the nearest in time on both sides that stand somewhere else."""
-
-    def centre(key: int) -> Array:
-        pose = camera_from_submap[key]
-        return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
-
-    steps = [float(np.linalg.norm(centre(a) - centre(b))) for a, b in itertools.pairwise(positions)]
-    minimum = 0.2 * float(np.median(steps)) if steps else 0.0
-    others = [p for p in positions if p != position and np.linalg.norm(centre(p) - centre(position)) > minimum]
-    return sorted(others, key=lambda other: (abs(other - position), other))[:_MAX_NEIGHBOURS]
-
-
-def _sweep(
-    reference: Map,
-    sources: Sequence[Map],
-    source_from_reference: Sequence[Array],
-    nearest_inverse_depth: float,
-    intrinsics: Intrinsics,
-    rays: Array,
-    usable: npt.NDArray[np.bool_],
-) -> _Sweep:
-    height, width = reference.shape
-    window = (_WINDOW_PX, _WINDOW_PX)
-    step = nearest_inverse_depth / (_HYPOTHESES - 1)
-    mean = cv2.boxFilter(reference, -1, window)
-    variance = np.maximum(cv2.boxFilter(reference * reference, -1, window) - mean * mean, 0.0)
-    volume = np.full((len(sources), _HYPOTHESES, height, width), -1.0, dtype=np.float32)
-    directions = [
-        np.einsum("ij,hwj->hwi", transform[:3, :3], rays).astype(np.float32) for transform in source_from_reference
-    ]
-    for n, source in enumerate(sources):
-        offset = source_from_reference[n][:3, 3]
-        for k in range(_HYPOTHESES):
-            u, v = _project(directions[n], offset * (k * step), intrinsics)
-            warped = cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1e4)
-            warped_mean = cv2.boxFilter(warped, -1, window)
-            warped_variance = cv2.boxFilter(warped * warped, -1, window) - warped_mean * warped_mean
-            product = cv2.boxFilter(warped * reference, -1, window) - warped_mean * mean
-            correlation = product / np.sqrt(
-                np.maximum(warped_variance, _TEXTURE_VARIANCE) * np.maximum(variance, _TEXTURE_VARIANCE)
-            )
-            volume[n, k] = np.where((warped_mean >= 0.0) & (warped_variance < 1e5), correlation, -1.0)
-    # the better half of the neighbours: the other half may be occluded or out of view
-    kept = (len(sources) + 1) // 2
-    score = np.sort(volume, axis=0)[-kept:].mean(axis=0)
-    best = score[1:-1].argmax(axis=0) + 1
-    rows, columns = np.indices((height, width))
-    below, top, above = score[best - 1, rows, columns], score[best, rows, columns], score[best + 1, rows, columns]
-    curvature = 2.0 * top - below - above
-    shift = np.clip(np.where(curvature > 1e-6, 0.5 * (above - below) / np.maximum(curvature, 1e-6), 0.0), -0.5, 0.5)
-    inverse_depth = ((best + shift) * step).astype(np.float32)
-    # movement of the match per relative change of depth, in the neighbour that sees most of it
-    travel = np.zeros((height, width), dtype=np.float32)
-    for n in range(len(sources)):
-        offset = source_from_reference[n][:3, 3].astype(np.float32)
-        u0, v0 = _project(directions[n], offset * 0.95 * inverse_depth[..., None], intrinsics)
-        u1, v1 = _project(directions[n], offset * 1.05 * inverse_depth[..., None], intrinsics)
-        inside = (u0 >= 0) & (u0 <= width - 1) & (v0 >= 0) & (v0 <= height - 1)
-        travel = np.maximum(travel, np.where(inside, np.hypot(u1 - u0, v1 - v0) / 0.1, 0.0))
-    relative_sigma = _MATCH_SIGMA_PX / np.maximum(travel, 1e-6)
-    known = usable & (variance > _TEXTURE_VARIANCE) & (top > 0.0)
-    return _Sweep(
-        np.where(known, inverse_depth, 0.0).astype(np.float32),
-        top.astype(np.float32),
-        relative_sigma.astype(np.float32),
-    )
-
-
-def _project(directions: Map, offset: npt.NDArray[np.floating], intrinsics: Intrinsics) -> tuple[Map, Map]:
-    """Pixels (u, v) of ``directions + offset``; far outside where behind the camera."""
-    moved = directions + offset.astype(np.float32)
-    z = moved[..., 2]
-    inverse = np.where(z > 1e-3, 1.0 / np.maximum(z, 1e-3), 0.0).astype(np.float32)
-    x, y = moved[..., 0] * inverse, moved[..., 1] * inverse
-    factor = 1.0 + intrinsics.k1 * (x * x + y * y)
-    u = np.where(z > 1e-3, intrinsics.fx * x * factor + intrinsics.cx, -1e4)
-    v = np.where(z > 1e-3, intrinsics.fy * y * factor + intrinsics.cy, -1e4)
-    return u.astype(np.float32), v.astype(np.float32)
-
-
-def _confidence(
-    position: int,
-    sweeps: Mapping[int, _Sweep],
-    neighbours: Sequence[int],
-    camera_from_submap: Mapping[int, Array],
-    intrinsics: Intrinsics,
-    rays: Array,
-    usable: npt.NDArray[np.bool_],
+def _judged(
+    found: stereo.Stereo, sigma: Map, confirmed: Map, neighbour_count: int, usable: npt.NDArray[np.bool_]
 ) -> DepthMap:
-    """Confidence from expected relative error, correlation, and agreement with the depth of the neighbours."""
-    own = sweeps[position]
-    known = own.inverse_depth > 0.0
-    depth = np.where(known, 1.0 / np.maximum(own.inverse_depth, 1e-9), 0.0)
-    points = rays * depth[..., None]
-    agreeing = np.zeros(depth.shape, dtype=np.float32)
-    for other in neighbours:
-        moved = se3.act(camera_from_submap[other] @ se3.inverse(camera_from_submap[position]), points)
-        pixels = project(moved, intrinsics)
-        u = np.nan_to_num(pixels[..., 0], nan=-1e4).astype(np.float32)
-        v = np.nan_to_num(pixels[..., 1], nan=-1e4).astype(np.float32)
-        seen = cv2.remap(
-            sweeps[other].inverse_depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0
+    certainty = 1.0 / (1.0 + (sigma / _HALF_RELATIVE_SIGMA) ** 2)
+    likeness = np.clip((found.correlation - _LOW_CORRELATION) / (_HIGH_CORRELATION - _LOW_CORRELATION), 0.0, 1.0)
+    needed = max(min(2, neighbour_count), 1)
+    confidence = certainty * likeness * np.clip(confirmed / needed, 0.0, 1.0)
+    known = usable & (found.inverse_depth > 0.0) & (confidence > 1e-3)
+    depth = np.where(known, 1.0 / np.maximum(found.inverse_depth, 1e-12), 0.0)
+    return DepthMap(depth.astype(np.float32), np.where(known, confidence, 0.0).astype(np.float32))
+
+
+def _relative_sigma(found: stereo.Stereo) -> Map:
+    """Expected relative error of depth (H, W), from the travel of the match and the sharpness of its correlation."""
+    mismatch = np.clip(1.0 - found.correlation, 0.02, 1.0)
+    sharpness = np.maximum(found.curvature, 1e-3)
+    sigma_px = np.sqrt(_MATCH_SIGMA_PX**2 + 0.1 * mismatch / sharpness)
+    return np.asarray(sigma_px / np.maximum(found.travel_px, 1e-4), dtype=np.float32)
+
+
+def _neighbours(
+    position: int,
+    positions: Sequence[int],
+    camera_from_submap: Mapping[int, Array],
+    sparse: SparseDepth,
+    intrinsics: Intrinsics,
+) -> list[int]:
+    """Frames to match with: those whose view differs enough to see depth and little enough to look alike."""
+    index = positions.index(position)
+    scored = []
+    for other in positions[max(index - _REACH, 0) : index + _REACH + 1]:
+        if other == position:
+            continue
+        moved, parallax = _parallax_px(
+            camera_from_submap[other] @ se3.inverse(camera_from_submap[position]), sparse, intrinsics
         )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            difference = np.abs(seen * moved[..., 2] - 1.0)
-        agreeing += (seen > 0.0) & (difference < _CONSISTENT_RELATIVE + 2.0 * own.relative_sigma)
-    certainty = 1.0 / (1.0 + (own.relative_sigma / _GOOD_RELATIVE_SIGMA) ** 2)
-    likeness = np.clip((own.score - 0.4) / 0.5, 0.0, 1.0)
-    agreement = np.clip(agreeing / max(min(2, len(neighbours)), 1), 0.0, 1.0)
-    confidence = np.where(known & usable, certainty * likeness * agreement, 0.0)
-    return DepthMap(np.where(usable, depth, 0.0).astype(np.float32), np.clip(confidence, 0.0, 1.0).astype(np.float32))
+        if moved.size == 0 or parallax < 0.3:
+            continue
+        visible = float(moved.mean())
+        score = visible * math.exp(-0.5 * (math.log(parallax / _BEST_PARALLAX_PX) / _PARALLAX_LOG_WIDTH) ** 2)
+        scored.append((-score, abs(other - position), other))
+    return [other for _, _, other in sorted(scored)[:_MAX_NEIGHBOURS]]
+
+
+def _parallax_px(
+    other_from_this: Array, sparse: SparseDepth, intrinsics: Intrinsics
+) -> tuple[npt.NDArray[np.bool_], float]:
+    """Which points the other frame sees, and the median movement in pixels that its translation causes."""
+    points = sparse.points_camera
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.bool_), 0.0
+    turned = points @ other_from_this[:3, :3].T
+    moved = turned + other_from_this[:3, 3]
+    front = (turned[:, 2] > 1e-9) & (moved[:, 2] > 1e-9)
+    a = turned[:, :2] / np.where(front, turned[:, 2], 1.0)[:, None]
+    b = moved[:, :2] / np.where(front, moved[:, 2], 1.0)[:, None]
+    u, v = b[:, 0] * intrinsics.fx + intrinsics.cx, b[:, 1] * intrinsics.fy + intrinsics.cy
+    seen = front & (u >= 0) & (v >= 0) & (u < intrinsics.width_px) & (v < intrinsics.height_px)
+    if not seen.any():
+        return seen, 0.0
+    return seen, float(np.median(np.linalg.norm(b[seen] - a[seen], axis=1)) * intrinsics.fx)
+
+
+def _nearest_inverse_depths(sparse: Mapping[int, SparseDepth]) -> dict[int, float]:
+    """Per frame, the inverse depth beyond which next to nothing lies."""
+    inverse = {p: 1.0 / s.points_camera[:, 2][s.points_camera[:, 2] > 1e-9] for p, s in sparse.items()}
+    everything = np.concatenate(list(inverse.values())) if inverse else np.zeros(0)
+    typical = float(np.percentile(everything, 98.0)) if len(everything) else 1.0
+    return {p: 1.4 * (float(np.percentile(v, 98.0)) if len(v) >= 20 else typical) for p, v in inverse.items()}
+
+
+def _hypotheses(views: Sequence[stereo.View], sparse: SparseDepth, intrinsics: Intrinsics, nearest: float) -> int:
+    """As many as make a step about one pixel of the half-size sweep, where the points are."""
+    travel = []
+    z = sparse.points_camera[:, 2]
+    points = sparse.points_camera[z > 1e-9]
+    for view in views:
+        rotation, translation = view.view_from_reference[:3, :3], view.view_from_reference[:3, 3]
+        rays = points / points[:, 2:]
+        near = rays @ rotation.T + translation * (1.0 / points[:, 2:] + 0.01 * nearest)
+        far = rays @ rotation.T + translation / points[:, 2:]
+        front = (near[:, 2] > 0.05) & (far[:, 2] > 0.05)
+        if front.any():
+            a, b = near[front, :2] / near[front, 2:], far[front, :2] / far[front, 2:]
+            travel.append(float(np.percentile(np.linalg.norm(a - b, axis=1), 75.0)) * intrinsics.fx / 0.01)
+    wanted = 0.5 * max(travel) if travel else 0.0
+    return int(min(max(wanted, _MIN_HYPOTHESES), _MAX_HYPOTHESES))
+
+
+@numba.njit(cache=True)
+def agreement(inverse_depth, sigma, other_inverse_depth, other_sigma, other_from_this, rays, camera, tolerance):  # type: ignore[no-untyped-def]
+    """1 where the other frame's depth of the same surface agrees (H, W), else 0."""
+    height, width = inverse_depth.shape
+    r, t = other_from_this[:3, :3], other_from_this[:3, 3]
+    out = np.zeros((height, width), dtype=np.float32)
+    for i in range(height):
+        for j in range(width):
+            w = inverse_depth[i, j]
+            if w <= 0.0:
+                continue
+            x, y = rays[i, j, 0], rays[i, j, 1]
+            px = r[0, 0] * x + r[0, 1] * y + r[0, 2] + w * t[0]
+            py = r[1, 0] * x + r[1, 1] * y + r[1, 2] + w * t[1]
+            pz = r[2, 0] * x + r[2, 1] * y + r[2, 2] + w * t[2]
+            if pz < 0.05:
+                continue
+            a, b = px / pz, py / pz
+            factor = 1.0 + camera[4] * (a * a + b * b)
+            u = math.floor(camera[0] * a * factor + camera[2] + 0.5)
+            v = math.floor(camera[1] * b * factor + camera[3] + 0.5)
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            # depth of the surface in the other frame, from here and from there
+            ratio = other_inverse_depth[v, u] * pz / w
+            if abs(ratio - 1.0) < tolerance + 2.0 * min(max(sigma[i, j], other_sigma[v, u]), 0.1):
+                out[i, j] = 1.0
+    return out

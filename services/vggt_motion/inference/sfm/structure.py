@@ -1,206 +1,240 @@
-"""Camera poses, points and focal length of one submap from matched features, by pycolmap's global mapping."""
+"""Camera poses, points and the camera itself of one submap, from its tracks.
+
+The submap is grown frame by frame from several guesses of the focal length, each result is adjusted with the camera
+free within its priors, and the one that explains most observations is kept: a mirrored or bent scene leaves many
+unexplained.
+"""
 
 from __future__ import annotations
 
-import logging
-import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.inference.sfm.library import load_pycolmap
-
-_LOG = logging.getLogger(__name__)
+from vggt_motion.inference.sfm import bundle, growth
+from vggt_motion.inference.sfm.bundle import Calibration, Observations, Scene
+from vggt_motion.inference.sfm.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
-Pair = tuple[int, int]
+Index = npt.NDArray[np.int64]
 
-_MIN_PAIR_MATCHES = 20
-_EPIPOLAR_PX = 1.5
+# Errors of tracks are alike in neighbouring frames and pixels (drift, moving things, distortion beyond one
+# coefficient): they carry less information than their scatter of 0.2 px suggests. With this deviation the focal lengths
+# of the evaluation drives lie within their stated uncertainty.
+PIXEL_SIGMA = 1.0
+_TYPICAL_FOCAL_OVER_WIDTH = 0.85
+_TYPICAL_FOCAL_LOG_SIGMA = 0.5
+_PRINCIPAL_SIGMA_OVER_WIDTH = 0.012
+_K1_SIGMA = 0.03
+_UNKNOWN_STARTS = (0.65, 1.1, 1.8)  # focal length / image width to grow from where nothing is known
+_LAST_USUAL_START = 1.5  # longer focal lengths are tried only where the others explain little
+_SURE_RELATIVE_SIGMA = 0.1  # a hint at least this sure is the only start
+_REGROW_RELATIVE = 0.12  # a focal length that moved so far is grown from once more
+_GOOD_EXPLAINED = 0.75  # share of observations that fit: no further start is tried
+_K1_GAIN = 0.05  # relative decrease of the cost for which a radial coefficient is believed
+_CAPPED_PX = 20.0
+_STAGES = (
+    (2.0, 12.0, 15, 1e-4),
+    (1.0, 5.0, 20, 1e-5),
+    (0.5, 2.5, 60, 1e-6),
+)  # kernel px, gate px, iterations, tolerance
+
+
+@dataclass(frozen=True)
+class CameraPrior:
+    """What is known about the camera before the submap is looked at."""
+
+    focal_over_width: float | None = None
+    relative_sigma: float = math.inf
+    radial_k1: float = 0.0
+    is_fixed: bool = False
 
 
 @dataclass(frozen=True)
 class Structure:
-    """A solved submap. Pixels are those of the working images; pixel centres lie at whole numbers."""
+    """A solved submap; pixels are those of the working images, relative to the middle of the image."""
 
-    camera_from_submap: dict[int, Array]  # position -> (4, 4)
-    focal_px: float
-    points: Array  # (P, 3), submap units
-    observation_point: npt.NDArray[np.int64]  # (O,) index into points
-    observation_position: npt.NDArray[np.int64]  # (O,) position of the frame
-    observation_pixel: Array  # (O, 2)
-    reprojection_px: float  # mean
+    positions: tuple[int, ...]  # the frames of ``scene``, positions in the submap
+    registered: npt.NDArray[np.bool_]  # (F,)
+    scene: Scene
+    observations: Observations  # the ones that fit
+    explained: float  # share of all observations that fit
+    reprojection_px: float  # mean length of the residuals that fit
     median_parallax_deg: float
-    match_inlier_ratio: float  # of the matches that agree with the two-view geometry of their pair
+    focal_relative_sigma: float  # as this submap alone sees it; inf where held
+    cost: float  # capped robust cost of all observations, to compare solutions of the same tracks by
+
+    def camera_from_submap(self) -> dict[int, Array]:
+        """Position of each registered frame -> (4, 4)."""
+        poses = {}
+        for index in np.flatnonzero(self.registered):
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = self.scene.rotations[index], self.scene.translations[index]
+            poses[self.positions[index]] = pose
+        return poses
 
 
-def solve_global(
-    points: Mapping[int, npt.NDArray[np.float32]],
-    matches: Mapping[Pair, npt.NDArray[np.int64]],
-    width_px: int,
-    height_px: int,
-    focal_px: float | None,
-    is_focal_held: bool,
-    seed: int,
-) -> Structure | None:
-    """Solve a submap by COLMAP's global mapping (GLOMAP); the same input gives the same bits.
-
-    Args:
-        points: position -> features (N, 2) in pixels.
-        matches: pair of positions -> matched feature indices (M, 2).
-        width_px: image width.
-        height_px: image height.
-        focal_px: start value, None to calibrate from the fundamental matrices.
-        is_focal_held: do not refine the focal length.
-        seed: of everything random.
+def solve(
+    tracks: Tracks, positions: Sequence[int], width_px: int, height_px: int, prior: CameraPrior
+) -> tuple[Structure | None, list[str]]:
+    """Solve a submap.
 
     Returns:
-        None where no model of at least three frames was found.
+        the best solution, None where there is none; and one line for each way that was tried.
     """
-    pycolmap: Any = load_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
-    pycolmap.set_random_seed(seed)
-    positions = sorted(points)
-    with tempfile.TemporaryDirectory(prefix="vggt-motion-sfm-") as folder:
-        path = Path(folder) / "submap.db"
-        matched, agreed = _write_database(pycolmap, path, points, matches, width_px, height_px, focal_px, seed)
-        if focal_px is None:
-            options = pycolmap.ViewGraphCalibrationOptions()
-            options.random_seed = seed
-            pycolmap.calibrate_view_graph(str(path), options)
-        output = Path(folder) / "models"
-        output.mkdir()
-        try:
-            models = pycolmap.global_mapping(
-                str(path), folder, str(output), _mapping_options(pycolmap, seed, is_focal_held)
-            )
-        except (RuntimeError, ValueError) as error:
-            _LOG.info("global mapping gave up: %s", " ".join(str(error).split()))
-            return None
-    usable = [model for model in models.values() if model.num_reg_images() >= 3 and model.num_points3D() >= 20]
-    if not usable:
+    centre = np.array([0.5 * (width_px - 1), 0.5 * (height_px - 1)])
+    index = np.full(max(positions) + 1, -1)
+    index[list(positions)] = np.arange(len(positions))
+    observations = Observations.build(tracks.point, index[tracks.frame], tracks.pixel - centre, tracks.count)
+    best: Structure | None = None
+    attempts = []
+    for start in _starts(prior):
+        if best is not None and best.explained > _GOOD_EXPLAINED and (_is_sure(prior) or start > _LAST_USUAL_START):
+            break
+        solved = _from_start(observations, positions, width_px, prior, start)
+        attempts.append(f"grown from focal {start:.2f} widths: {_outcome(solved, width_px)}")
+        best = _better(best, solved)
+        if solved is None or solved is not best or not _is_worth_regrowing(solved, start, width_px, prior):
+            continue
+        moved = solved.scene.focal_px / width_px
+        again = _from_start(observations, positions, width_px, prior, moved)
+        attempts.append(f"grown from focal {moved:.2f} widths: {_outcome(again, width_px)}")
+        best = _better(best, again)
+    if best is not None and not prior.is_fixed:
+        distorted = _adjusted(observations, best.registered, positions, best.scene, width_px, prior, refine_k1=True)
+        if distorted is not None and distorted.cost < (1.0 - _K1_GAIN) * best.cost:
+            attempts.append(f"with a radial coefficient: {_outcome(distorted, width_px)}")
+            best = distorted
+    return (_in_unit_steps(best) if best is not None else None), attempts
+
+
+def _is_worth_regrowing(solved: Structure, start: float, width_px: int, prior: CameraPrior) -> bool:
+    """Whether the focal length moved so far in a turn that the scene may have kept a bend from its start."""
+    if prior.is_fixed or bundle.looks_one_way(solved.scene.rotations[solved.registered]):
+        return False
+    return abs(math.log(solved.scene.focal_px / width_px / start)) > _REGROW_RELATIVE
+
+
+def _in_unit_steps(solved: Structure) -> Structure:
+    """The same structure in the unit of the median step between its keyframes, which suits half-precision depth."""
+    scene = solved.scene
+    centres = -np.einsum("fji,fj->fi", scene.rotations, scene.translations)[solved.registered]
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    unit = float(np.median(steps)) if len(steps) and np.median(steps) > 0.0 else 1.0
+    return replace(solved, scene=replace(scene, translations=scene.translations / unit, points=scene.points / unit))
+
+
+def _is_sure(prior: CameraPrior) -> bool:
+    return prior.is_fixed or prior.relative_sigma < _SURE_RELATIVE_SIGMA
+
+
+def _starts(prior: CameraPrior) -> Iterator[float]:
+    known = prior.focal_over_width
+    if known is None:
+        yield from _UNKNOWN_STARTS
+        return
+    yield known
+    if not prior.is_fixed:
+        yield from sorted(_UNKNOWN_STARTS, key=lambda start: (start > _LAST_USUAL_START, -abs(math.log(start / known))))
+
+
+def _better(best: Structure | None, other: Structure | None) -> Structure | None:
+    if best is None or other is None:
+        return best or other
+    return min(best, other, key=lambda solved: solved.cost)
+
+
+def _outcome(solved: Structure | None, width_px: int) -> str:
+    if solved is None:
+        return "no structure"
+    return (
+        f"{int(solved.registered.sum())} keyframes, {solved.explained:.0%} of the observations fit to "
+        f"{solved.reprojection_px:.2f} px, focal {solved.scene.focal_px / width_px:.3f}"
+    )
+
+
+def _from_start(
+    observations: Observations, positions: Sequence[int], width_px: int, prior: CameraPrior, focal_over_width: float
+) -> Structure | None:
+    nothing = np.zeros((0, 3))
+    camera = Scene(np.zeros((0, 3, 3)), nothing, nothing, focal_over_width * width_px, prior.radial_k1)
+    grown = growth.grow(observations, len(positions), camera)
+    if grown is None:
         return None
-    model = max(usable, key=lambda candidate: (candidate.num_reg_images(), candidate.num_points3D()))
-    return _read_model(model, positions, agreed / max(matched, 1))
+    return _adjusted(observations, grown.registered, positions, grown.scene, width_px, prior, refine_k1=False)
 
 
-def _write_database(
-    pycolmap: Any,
-    path: Path,
-    points: Mapping[int, npt.NDArray[np.float32]],
-    matches: Mapping[Pair, npt.NDArray[np.int64]],
+def _adjusted(
+    observations: Observations,
+    registered: npt.NDArray[np.bool_],
+    positions: Sequence[int],
+    scene: Scene,
     width_px: int,
-    height_px: int,
-    focal_px: float | None,
-    seed: int,
-) -> tuple[int, int]:
-    """Fill the database; returns how many matches there were and how many agreed with their pair's geometry."""
-    start = focal_px if focal_px is not None else 0.9 * width_px
-    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.SIMPLE_PINHOLE, start, width_px, height_px)
-    camera.has_prior_focal_length = focal_px is not None
-    database = pycolmap.Database.open(str(path))
-    matched = agreed = 0
-    try:
-        database.write_camera(camera, True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, True)
-        colmap_points = {position: pixels.astype(np.float64) + 0.5 for position, pixels in points.items()}
-        for position in sorted(points):
-            image = pycolmap.Image(name=f"{position:06d}", camera_id=1, image_id=position + 1)
-            image.frame_id = position + 1
-            frame = pycolmap.Frame(frame_id=position + 1, rig_id=1)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, True)
-            database.write_image(image, True)
-            database.write_keypoints(position + 1, colmap_points[position].astype(np.float32))
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.max_error = _EPIPOLAR_PX
-        options.ransac.random_seed = seed
-        options.compute_relative_pose = True
-        options.detect_watermark = False
-        for (a, b), pair_matches in sorted(matches.items()):
-            if len(pair_matches) < _MIN_PAIR_MATCHES:
-                continue
-            indices = pair_matches.astype(np.uint32)
-            geometry = pycolmap.estimate_two_view_geometry(
-                camera, colmap_points[a], camera, colmap_points[b], indices, options
-            )
-            matched += len(indices)
-            agreed += len(geometry.inlier_matches)
-            database.write_matches(a + 1, b + 1, indices)
-            database.write_two_view_geometry(a + 1, b + 1, geometry)
-    finally:
-        database.close()
-    return matched, agreed
-
-
-def _mapping_options(pycolmap: Any, seed: int, is_focal_held: bool) -> Any:
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = 1
-    options.random_seed = seed
-    mapper = options.mapper
-    mapper.num_threads = 1
-    mapper.random_seed = seed
-    mapper.rotation_averaging.random_seed = seed
-    mapper.global_positioning.random_seed = seed
-    mapper.global_positioning.use_gpu = False
-    mapper.retriangulation.random_seed = seed
-    mapper.bundle_adjustment.ceres.use_gpu = False
-    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-    mapper.bundle_adjustment.refine_focal_length = not is_focal_held
-    return options
-
-
-def _read_model(model: Any, positions: Sequence[int], match_inlier_ratio: float) -> Structure:
-    poses: dict[int, Array] = {}
-    for image_id in sorted(model.reg_image_ids()):
-        pose = np.eye(4)
-        pose[:3] = model.image(image_id).cam_from_world().matrix()
-        poses[image_id - 1] = pose
-    point_ids = sorted(model.points3D)
-    points = np.array([model.points3D[point_id].xyz for point_id in point_ids])
-    rows: list[tuple[int, int, float, float]] = []
-    errors: list[float] = []
-    for index, point_id in enumerate(point_ids):
-        point = model.points3D[point_id]
-        errors.append(float(point.error))
-        for element in point.track.elements:
-            pixel = model.image(element.image_id).points2D[element.point2D_idx].xy
-            rows.append((index, element.image_id - 1, float(pixel[0]) - 0.5, float(pixel[1]) - 0.5))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    observed_point = table[:, 0].astype(np.int64)
-    position = table[:, 1].astype(np.int64)
+    prior: CameraPrior,
+    refine_k1: bool,
+) -> Structure | None:
+    calibration = _calibration(prior, width_px, refine_k1)
+    fixed = int(np.argmax(registered))
+    fitting = observations
+    for robust_px, gate_px, iterations, tolerance in _STAGES:
+        rays = growth.rays_of(observations, scene)
+        scene, fitting = growth.retriangulate(scene, observations, rays, registered, robust_px, gate_px)
+        if len(fitting.frame) < 4 * registered.sum():
+            return None
+        scene = bundle.adjust(scene, fitting, calibration, robust_px, PIXEL_SIGMA, iterations, tolerance, fixed).scene
+    residuals = np.linalg.norm(bundle.residuals(scene, fitting), axis=1)
+    everything = np.linalg.norm(bundle.residuals(scene, observations), axis=1)
+    information, _ = bundle.shared_information(scene, fitting, calibration, _STAGES[-1][0], fixed)
     return Structure(
-        camera_from_submap=poses,
-        focal_px=float(next(iter(model.cameras.values())).focal_length),
-        points=points,
-        observation_point=observed_point,
-        observation_position=position,
-        observation_pixel=table[:, 2:].copy(),
-        reprojection_px=float(np.mean(errors)),
-        median_parallax_deg=_median_parallax_deg(points, poses, observed_point, position),
-        match_inlier_ratio=match_inlier_ratio,
+        positions=tuple(positions),
+        registered=registered,
+        scene=scene,
+        observations=fitting,
+        explained=len(fitting.frame) / max(len(observations.frame), 1),
+        reprojection_px=float(residuals.mean()),
+        median_parallax_deg=_median_parallax_deg(scene, fitting),
+        focal_relative_sigma=_focal_sigma(information, calibration),
+        cost=float(np.log1p(np.minimum(everything, _CAPPED_PX) ** 2).sum()),
     )
 
 
-def _median_parallax_deg(
-    points: Array, poses: Mapping[int, Array], index: npt.NDArray[np.int64], position: npt.NDArray[np.int64]
-) -> float:
+def _calibration(prior: CameraPrior, width_px: int, refine_k1: bool) -> Calibration:
+    principal = _PRINCIPAL_SIGMA_OVER_WIDTH * width_px
+    focal = prior.focal_over_width if prior.focal_over_width is not None else _TYPICAL_FOCAL_OVER_WIDTH
+    sigma = min(max(prior.relative_sigma, 1e-4), _TYPICAL_FOCAL_LOG_SIGMA)
+    return Calibration(
+        free=(not prior.is_fixed, refine_k1, not prior.is_fixed, not prior.is_fixed),
+        mean=(math.log(focal * width_px), prior.radial_k1, 0.0, 0.0),
+        sigma=(sigma, _K1_SIGMA, principal, principal),
+    )
+
+
+def _focal_sigma(information: Array, calibration: Calibration) -> float:
+    """Standard deviation of log focal from the observations; the other shared unknowns have their priors."""
+    free = np.flatnonzero(calibration.free)
+    if 0 not in free:
+        return math.inf
+    priors = np.array([0.0, *(1.0 / sigma**2 for sigma in calibration.sigma[1:])])
+    block = information[np.ix_(free, free)] / PIXEL_SIGMA**2 + np.diag(priors[free])
+    if not np.isfinite(block).all():
+        return math.inf
+    others = block[1:, 1:]
+    reduced = float(block[0, 0] - block[0, 1:] @ np.linalg.solve(others, block[1:, 0]))
+    return 1.0 / math.sqrt(reduced) if reduced > 1e-12 else math.inf
+
+
+def _median_parallax_deg(scene: Scene, observations: Observations) -> float:
     """Median over the points of the angle between the rays of the first and the last frame that see each."""
-    centres = np.zeros((max(poses) + 1, 3))
-    for key, pose in poses.items():
-        centres[key] = -pose[:3, :3].T @ pose[:3, 3]
-    first = np.full(len(points), np.iinfo(np.int64).max)
-    last = np.full(len(points), -1)
-    np.minimum.at(first, index, position)
-    np.maximum.at(last, index, position)
-    ray_a, ray_b = points - centres[first], points - centres[last]
-    cosine = (ray_a * ray_b).sum(axis=1) / np.maximum(
-        np.linalg.norm(ray_a, axis=1) * np.linalg.norm(ray_b, axis=1), 1e-12
-    )
+    start = observations.start
+    seen = np.flatnonzero(np.diff(start) >= 2)
+    if len(seen) == 0:
+        return 0.0
+    centres = -np.einsum("fji,fj->fi", scene.rotations, scene.translations)
+    first, last = observations.frame[start[seen]], observations.frame[start[seen + 1] - 1]
+    ray_a, ray_b = scene.points[seen] - centres[first], scene.points[seen] - centres[last]
+    norms = np.linalg.norm(ray_a, axis=1) * np.linalg.norm(ray_b, axis=1)
+    cosine = (ray_a * ray_b).sum(axis=1) / np.maximum(norms, 1e-12)
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))

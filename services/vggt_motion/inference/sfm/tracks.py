@@ -1,0 +1,165 @@
+"""Point tracks through the keyframes of a submap: corners followed by Lucas-Kanade that starts from dense flow.
+
+Shi and Tomasi, "Good Features to Track" (1994); Kroeger et al., "Fast Optical Flow using Dense Inverse Search" (2016).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vggt_motion.inference.sfm import features
+from vggt_motion.inference.sfm.images import GreyImage, WorkingImages
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Points = npt.NDArray[np.float32]
+
+_MAX_CORNERS = 1200
+_CORNER_QUALITY = 0.002
+_CORNER_DISTANCE_PX = 7
+_CORNER_BLOCK_PX = 5
+_WINDOW_PX = 15
+_PYRAMID_LEVELS = 1
+_ROUND_TRIP_PX = 0.7
+_BORDER_PX = 4
+_MIN_FOLLOWED = 80  # fewer tracks over a step are helped out by feature matches
+_SAME_POINT_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of points, sorted by point and frame; pixels of the working image, centres at whole numbers."""
+
+    point: Index  # (O,) 0 .. count - 1
+    frame: Index  # (O,) position of the keyframe
+    pixel: Array  # (O, 2)
+    count: int
+
+    def between(self, a: int, b: int) -> tuple[Index, Array, Array]:
+        """Points seen in both frames, and where: indices (M,), pixels (M, 2) in ``a`` and in ``b``."""
+        in_a, in_b = np.flatnonzero(self.frame == a), np.flatnonzero(self.frame == b)
+        shared, at_a, at_b = np.intersect1d(self.point[in_a], self.point[in_b], assume_unique=True, return_indices=True)
+        return shared, self.pixel[in_a[at_a]], self.pixel[in_b[at_b]]
+
+
+def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
+    """Follow corners from keyframe to keyframe; new ones start where none is left."""
+    create: Any = getattr(cv2, "DISOpticalFlow_create")  # noqa: B009  -- missing in the stubs of OpenCV 5
+    estimator = create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    height, width = working.height_px, working.width_px
+    ids = np.zeros(0, dtype=np.int64)
+    pixels = np.zeros((0, 2), dtype=np.float32)
+    next_id = 0
+    rows: list[tuple[Index, int, Points]] = []
+    for a, b in itertools.pairwise(positions):
+        fresh = _corners(working.grey[a], working.usable, pixels)
+        ids = np.concatenate([ids, np.arange(next_id, next_id + len(fresh))])
+        pixels = np.concatenate([pixels, fresh])
+        rows.append((ids[len(ids) - len(fresh) :], a, fresh))
+        next_id += len(fresh)
+        flow = estimator.calc(working.grey[a], working.grey[b], None)
+        moved, kept = _track(working.grey[a], working.grey[b], pixels, pixels + _sample(flow, pixels))
+        inside = np.all((moved >= _BORDER_PX) & (moved <= np.array([width, height]) - 1 - _BORDER_PX), axis=1)
+        kept &= inside
+        nearest = np.rint(np.where(inside[:, None], moved, 0.0)).astype(np.int64)
+        kept &= working.usable[nearest[:, 1], nearest[:, 0]]
+        followed, landed = ids[kept], moved[kept]
+        rows.append((followed, b, landed))
+        if len(followed) < _MIN_FOLLOWED:
+            # too large a step for tracking: features do not care how far they moved
+            matched_ids, new_at_a, at_b = _rejoin(working, a, b, ids[~kept], pixels[~kept], next_id)
+            rows.append((np.arange(next_id, next_id + len(new_at_a)), a, new_at_a))
+            rows.append((matched_ids, b, at_b))
+            next_id += len(new_at_a)
+            followed, landed = np.concatenate([followed, matched_ids]), np.concatenate([landed, at_b])
+        ids, pixels = followed, landed
+    return _assemble(rows)
+
+
+def _rejoin(
+    working: WorkingImages, a: int, b: int, lost_ids: Index, lost: Points, next_id: int
+) -> tuple[Index, Points, Points]:
+    """Continue lost tracks, and begin new ones, by matched features.
+
+    Returns:
+        ids (M,) of the matches, lost ones first taken up again, the rest numbered from ``next_id``; where the new ones
+        are in ``a``; where all are in ``b``.
+    """
+    features_a = features.detect(working.grey[a], working.usable)
+    features_b = features.detect(working.grey[b], working.usable)
+    rows = features.match(features_a, features_b)
+    at_a, at_b = features_a.points[rows[:, 0]], features_b.points[rows[:, 1]]
+    ids = np.full(len(rows), -1, dtype=np.int64)
+    if len(lost) and len(rows):
+        distance = np.linalg.norm(at_a[:, None] - lost[None], axis=2)
+        nearest = distance.argmin(axis=1)
+        for row in np.flatnonzero(distance[np.arange(len(rows)), nearest] < _SAME_POINT_PX):
+            if lost_ids[nearest[row]] not in ids:
+                ids[row] = lost_ids[nearest[row]]
+    order = np.argsort(ids < 0, kind="stable")
+    ids, at_a, at_b = ids[order], at_a[order], at_b[order]
+    fresh = ids < 0
+    ids[fresh] = np.arange(next_id, next_id + int(fresh.sum()))
+    return ids, at_a[fresh], at_b
+
+
+def _corners(image: GreyImage, usable: npt.NDArray[np.bool_], taken: Points) -> Points:
+    mask = usable.astype(np.uint8) * 255
+    for x, y in np.rint(taken).astype(int):
+        cv2.circle(mask, (int(x), int(y)), _CORNER_DISTANCE_PX, 0, -1)
+    room = _MAX_CORNERS - len(taken)
+    if room <= 0:
+        return np.zeros((0, 2), dtype=np.float32)
+    corners = cv2.goodFeaturesToTrack(
+        image, room, _CORNER_QUALITY, _CORNER_DISTANCE_PX, mask=mask, blockSize=_CORNER_BLOCK_PX
+    )
+    if corners is None:
+        return np.zeros((0, 2), dtype=np.float32)
+    return np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+
+
+def _sample(flow: npt.NDArray[np.float32], pixels: Points) -> Points:
+    if not len(pixels):
+        return np.zeros((0, 2), dtype=np.float32)
+    sampled = cv2.remap(flow, pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled, dtype=np.float32).reshape(-1, 2)
+
+
+def _track(a: GreyImage, b: GreyImage, pixels: Points, guess: Points) -> tuple[Points, npt.NDArray[np.bool_]]:
+    """Positions in ``b``, and which of them came back to where they started."""
+    if not len(pixels):
+        return pixels, np.zeros(0, dtype=np.bool_)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
+    size = (_WINDOW_PX, _WINDOW_PX)
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        a, b, pixels, guess.astype(np.float32), winSize=size, maxLevel=_PYRAMID_LEVELS, criteria=criteria, flags=flags
+    )
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        b, a, moved, pixels.copy(), winSize=size, maxLevel=_PYRAMID_LEVELS, criteria=criteria, flags=flags
+    )
+    close = np.linalg.norm(back - pixels, axis=1) < _ROUND_TRIP_PX
+    return np.asarray(moved, dtype=np.float32), np.asarray(
+        (found.ravel() > 0) & (returned.ravel() > 0) & close & np.isfinite(moved).all(axis=1), dtype=np.bool_
+    )
+
+
+def _assemble(rows: Sequence[tuple[Index, int, Points]]) -> Tracks:
+    """Tracks of at least two frames, numbered without gaps."""
+    point = np.concatenate([ids for ids, _, _ in rows]) if rows else np.zeros(0, dtype=np.int64)
+    frames = [np.full(len(ids), position) for ids, position, _ in rows]
+    frame = np.concatenate(frames) if rows else np.zeros(0, dtype=np.int64)
+    pixel = np.concatenate([p for _, _, p in rows]).astype(np.float64) if rows else np.zeros((0, 2))
+    lengths = np.bincount(point) if len(point) else np.zeros(0, dtype=np.int64)
+    keep = lengths[point] >= 2
+    number = np.cumsum(lengths >= 2) - 1
+    point, frame, pixel = number[point[keep]], frame[keep], pixel[keep]
+    order = np.lexsort((frame, point))
+    return Tracks(point[order].astype(np.int64), frame[order].astype(np.int64), pixel[order], int((lengths >= 2).sum()))
