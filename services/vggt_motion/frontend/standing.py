@@ -25,45 +25,23 @@ costs next to nothing, as without parallax no frame becomes a keyframe. In doubt
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from vggt_motion.frontend.flow import CellGrid, DenseFlow, Flow, Grey
-from vggt_motion.frontend.motion import is_quasi_static
 
 LOOKBACK_S = 0.5
+CHECK_INTERVAL_S = 0.2  # between two comparisons over a long baseline, which cost one or two flows each
 EXIT_SHIFT_OVER_STATIC = 3.0  # of tau_flow: 2.1 px at 320 px, 0.4-0.5 m of forward motion on KITTI
 EXIT_STATIC_RATIO = 0.6  # below it most of the image moves: then a shift of tau_flow is enough
 UPPER_QUARTILE_FACTOR = 2.5  # the bound on the upper quartile over that on the median
 
-_MIN_VOTES_SHARE = 0.05  # of all cells; with fewer votes nothing is decided
-_CHECK_SHARE = 0.1  # of the cells seem to have moved: worth a forward-backward check
-
-
-@dataclass(frozen=True)
-class Shift:
-    """How far the image has shifted between two frames, judged by cells that show the same thing in both.
-
-    Attributes:
-        votes_share: share of all cells that have a vote: textured, and found again both ways.
-        median_px: median length of their flow, px of the working image.
-        upper_quartile_px: its upper quartile.
-    """
-
-    votes_share: float
-    median_px: float
-    upper_quartile_px: float
-
-    def exceeds(self, median_px: float, upper_quartile_px: float) -> bool:
-        """Whether one of the quantiles is beyond its bound; never without enough votes."""
-        is_beyond = self.median_px > median_px or self.upper_quartile_px > upper_quartile_px
-        return is_beyond and self.votes_share >= _MIN_VOTES_SHARE
+_MIN_VOTES_SHARE = 0.05  # of all cells; with fewer votes nothing has shifted
 
 
 class ShiftMeter:
-    """Measures the shift between two frames that need not be consecutive."""
+    """Tells whether the image has shifted between two frames that need not be consecutive."""
 
     def __init__(self, flow: DenseFlow, grid: CellGrid, static_flow_px: float) -> None:
         self._flow = flow
@@ -71,26 +49,37 @@ class ShiftMeter:
         self._static_flow_px = static_flow_px
         self._centres = grid.centres_px().reshape(grid.rows, grid.columns, 2)
 
-    def between(self, source: Grey, target: Grey, usable: npt.NDArray[np.bool_]) -> Shift:
-        """Compare two frames.
+    def has_shifted(
+        self,
+        source: Grey,
+        target: Grey,
+        usable: npt.NDArray[np.bool_],
+        *,
+        median_px: float,
+        upper_quartile_px: float,
+    ) -> bool:
+        """Whether the median or the upper quartile of the cells' shifts is beyond its bound.
 
-        The backward flow is only computed where it can matter: when a good share of the cells seems to have moved.
+        Only cells that show the same thing in both frames have a vote in the end; that is looked into, by the flow
+        back, when it matters.
 
         Args:
             source: working image (h, w).
             target: working image (h, w).
             usable: (rows, columns), cells of ``source`` with texture and outside the ego mask.
+            median_px: bound, px of the working image.
+            upper_quartile_px: bound, px of the working image.
         """
+
+        def is_beyond(votes: npt.NDArray[np.bool_]) -> bool:
+            if np.count_nonzero(votes) < _MIN_VOTES_SHARE * votes.size:
+                return False
+            median, quartile = np.percentile(lengths[votes], (50, 75))
+            return bool(median > median_px or quartile > upper_quartile_px)
+
         cells = self._grid.sample(self._flow.between(source, target))
-        votes = usable
-        moved = usable & ~is_quasi_static(cells, self._static_flow_px)
-        if int(np.count_nonzero(moved)) > _CHECK_SHARE * int(np.count_nonzero(usable)):
-            votes = usable & self._returns(cells, self._flow.between(target, source))
-        lengths = np.hypot(cells[..., 0], cells[..., 1])[votes]
-        if lengths.size == 0:
-            return Shift(0.0, 0.0, 0.0)
-        median, quartile = np.percentile(lengths, (50, 75))
-        return Shift(lengths.size / votes.size, float(median), float(quartile))
+        lengths = np.hypot(cells[..., 0], cells[..., 1])
+        return is_beyond(usable) and is_beyond(usable & self._returns(cells, self._flow.between(target, source)))
 
     def _returns(self, cells: Flow, backward: Flow) -> npt.NDArray[np.bool_]:
         """Forward-backward check: the cells whose content leads back to where it came from."""
@@ -120,6 +109,7 @@ class StandingDetector:
         self._static_flow_px = static_flow_px
         self._reference: tuple[Grey, npt.NDArray[np.bool_]] | None = None  # image and usable cells, while standing
         self._recent: deque[tuple[int, Grey, npt.NDArray[np.bool_]]] = deque()  # time, image, usable cells
+        self._next_check_ns = 0
 
     def decide(self, static_ratio: float, pixels: Grey, usable: npt.NDArray[np.bool_], capture_time_ns: int) -> bool:
         """Whether the camera stands at this frame.
@@ -131,11 +121,17 @@ class StandingDetector:
             capture_time_ns: of the frame.
         """
         self._remember(pixels, usable, capture_time_ns)
+        is_due = capture_time_ns >= self._next_check_ns
         if self._reference is None:
-            if static_ratio > self._static_ratio and not self._has_shifted_lately(pixels):
+            is_due = is_due and static_ratio > self._static_ratio
+            if is_due and not self._has_shifted_lately(pixels):
                 self._reference = (pixels, usable)
-        elif self._has_left(pixels, static_ratio):
-            self._reference = None
+        else:
+            is_due = is_due or static_ratio < EXIT_STATIC_RATIO
+            if is_due and self._has_left(pixels, static_ratio):
+                self._reference = None
+        if is_due:
+            self._next_check_ns = capture_time_ns + round(CHECK_INTERVAL_S * 1e9)
         return self._reference is not None
 
     def _remember(self, pixels: Grey, usable: npt.NDArray[np.bool_], capture_time_ns: int) -> None:
@@ -147,11 +143,18 @@ class StandingDetector:
     def _has_shifted_lately(self, pixels: Grey) -> bool:
         _, before, usable = self._recent[0]
         bound_px = self._static_flow_px
-        return self._meter.between(before, pixels, usable).exceeds(bound_px, UPPER_QUARTILE_FACTOR * bound_px)
+        return self._meter.has_shifted(
+            before, pixels, usable, median_px=bound_px, upper_quartile_px=UPPER_QUARTILE_FACTOR * bound_px
+        )
 
     def _has_left(self, pixels: Grey, static_ratio: float) -> bool:
         assert self._reference is not None
         reference, usable = self._reference
         bound_px = EXIT_SHIFT_OVER_STATIC * self._static_flow_px
-        median_px = self._static_flow_px if static_ratio < EXIT_STATIC_RATIO else bound_px
-        return self._meter.between(reference, pixels, usable).exceeds(median_px, UPPER_QUARTILE_FACTOR * bound_px)
+        return self._meter.has_shifted(
+            reference,
+            pixels,
+            usable,
+            median_px=self._static_flow_px if static_ratio < EXIT_STATIC_RATIO else bound_px,
+            upper_quartile_px=UPPER_QUARTILE_FACTOR * bound_px,
+        )
