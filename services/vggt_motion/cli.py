@@ -162,6 +162,124 @@ def _needed(value: Value | None, service: str, option: str) -> Value:
     return value
 
 
+@app.command()
+def evaluate(
+    estimate: Annotated[Path, typer.Argument(help="Trajectory to judge: TUM or KITTI.")],
+    ground_truth: Annotated[Path, typer.Argument(help="Reference trajectory: TUM or KITTI.")],
+    max_difference_s: Annotated[float, typer.Option(min=0.0, help="Greatest difference in time of a match.")] = 0.01,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Compare a trajectory with a reference: ATE, drift, KITTI relative errors, RPE.
+
+    Poses are matched by time; two KITTI files, which have no times, line by line.
+    """
+    from vggt_motion.evaluation import summary
+
+    errors = summary.evaluate_files(estimate, ground_truth, max_difference_s=max_difference_s)
+    sys.stdout.write(summary.to_json(errors) if as_json else summary.to_text(errors))
+
+
+@app.command()
+def record(
+    directory: Annotated[Path, typer.Argument(help="Folder that gets run.mcap.")],
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+) -> None:
+    """Record a running session until Ctrl-C: frames, records and views, in one MCAP file."""
+    from vggt_motion.recorder import service as recorder
+
+    raise typer.Exit(recorder.main(load_config(config, list(assignments or ())), directory=directory))
+
+
+@app.command()
+def replay(
+    file: Annotated[Path, typer.Argument(help="MCAP recording.")],
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    rate: Annotated[float, typer.Option(help="Speed: 2 = twice as fast, inf = as fast as they are taken.")] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    start_s: Annotated[float, typer.Option(help="Skip so many seconds.")] = 0.0,
+    duration_s: Annotated[float | None, typer.Option(help="Stop after so many seconds of the recording.")] = None,
+) -> None:
+    """Publish the frames of a recording on the image key, at the pace of their capture times."""
+    from vggt_motion.recorder import replay as player
+
+    settings = load_config(config, list(assignments or ()))
+    outcome = player.replay(file, settings, rate=rate, loop=loop, start_s=start_s, duration_s=duration_s)
+    Console(stderr=True, highlight=False).print(f"{outcome.frame_count} frames replayed")
+
+
+@app.command()
+def sessions(root: Annotated[Path, typer.Argument(help="Folder to search.")] = Path()) -> None:
+    """List the sessions at or below a folder."""
+    from vggt_motion.ledger.sessions import list_sessions
+
+    for session in list_sessions(root):
+        sys.stdout.write(session.to_text())
+
+
+@app.command()
+def health(
+    service: Annotated[str, typer.Argument(help=f"One of: {', '.join(SERVICES)}.")],
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    timeout_s: Annotated[float, typer.Option(min=0.1, help="How long to wait for a sign of life.")] = 5.0,
+) -> None:
+    """Exit with 0 if a service of this name is alive on the bus and said so within the last seconds, else with 1."""
+    from vggt_motion.bus.liveliness import ServiceWatch
+    from vggt_motion.bus.session import open_bus
+
+    if service not in SERVICES:
+        raise InputError(f"unknown service '{service}': known are {', '.join(SERVICES)}")
+    bus = open_bus(load_config(config, list(assignments or ())).bus)
+    try:
+        watch = ServiceWatch(bus)
+        report = watch.wait_for_report(service, timeout_s)
+        watch.close()
+    finally:
+        bus.close()
+    if report is None:
+        raise VggtMotionError(f"no {service} answered within {timeout_s:g} s")
+    sys.stdout.write(f"{report.service}/{report.instance}: {report.state} {report.detail}".rstrip() + "\n")
+
+
+@ledger_app.command("check")
+def ledger_check(
+    directory: Annotated[Path, typer.Argument(help="Folder of the ledger (of a run: OUT/ledger).")],
+    repair: Annotated[bool, typer.Option(help="Repair what can be repaired.")] = True,
+) -> None:
+    """Verify every row and payload of a ledger that nobody serves; exit with 1 if something is damaged."""
+    from vggt_motion.ledger.check import check
+
+    report = check(directory, repair=repair)
+    sys.stdout.write(report.to_text())
+    raise typer.Exit(0 if report.is_sound else 1)
+
+
+@ledger_app.command("export")
+def ledger_export(
+    directory: Annotated[Path, typer.Argument(help="Folder of the ledger.")],
+    archive: Annotated[Path, typer.Argument(help="File to write (tar).")],
+) -> None:
+    """Write a session into one file that can be imported elsewhere."""
+    from vggt_motion.ledger.export import export_session
+
+    report = export_session(directory, archive)
+    sys.stdout.write(f"{archive}: {report}\n")
+
+
+@ledger_app.command("import")
+def ledger_import(
+    archive: Annotated[Path, typer.Argument(help="File that export wrote.")],
+    directory: Annotated[Path, typer.Argument(help="Folder for the ledger, without one yet.")],
+) -> None:
+    """Make a ledger of an exported session."""
+    from vggt_motion.ledger.export import import_session
+
+    report = import_session(archive, directory)
+    sys.stdout.write(f"{directory}: {report}\n")
+
+
 @config_app.command("dump")
 def config_dump(config: ConfigOption = None, assignments: SetOption = None) -> None:
     """Print the effective configuration as YAML."""

@@ -35,6 +35,7 @@ from vggt_motion.evaluation.report_data import (
     ReportData,
     empty_track,
 )
+from vggt_motion.evaluation.summary import error_table, is_kitti
 from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_kitti, to_tum
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.geometry.track import PoseTrack
@@ -69,13 +70,7 @@ def read_ground_truth(path: Path) -> PoseTrack | list[PoseTrack]:
     Raises:
         InputError: the file cannot be read or is of neither form.
     """
-    try:
-        first = next(
-            (line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()[:1] not in "#"), ""
-        )
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read ground truth {path}: {error}") from error
-    return [read_kitti(path)] if len(first.split()) == 12 else read_tum(path)
+    return [read_kitti(path)] if is_kitti(path) else read_tum(path)
 
 
 def write_results(
@@ -252,18 +247,9 @@ def _errors(trajectory: Trajectory, reference: PoseTrack, component: int) -> dic
     except InputError as error:
         return {"not_evaluated": str(error)}
     return {
-        "ate_rmse_m": frames.ate_sim3.position_m.rmse,
-        "ate_max_m": frames.ate_sim3.position_m.max,
+        **error_table(frames),
         "ate_rmse_keyframes_m": keyframes.ate_sim3.position_m.rmse,
-        "ate_rmse_se3_m": frames.ate_se3.position_m.rmse,
-        "drift_ate_percent": frames.ate_sim3.drift_ate_percent,
-        "t_rel_percent": frames.kitti.t_rel_percent,
-        "r_rel_deg_per_100m": frames.kitti.r_rel_deg_per_100m,
-        "rpe_translation_rmse_m": frames.rpe.translation_m.rmse,
-        "rpe_rotation_rmse_deg": frames.rpe.rotation_deg.rmse,
-        "reference_length_m": frames.reference_length_m,
-        "evaluated_frame_count": frames.matched_count,
-        "reference_frame_count": len(reference),
+        "reference_pose_count": len(reference),
     }
 
 

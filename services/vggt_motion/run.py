@@ -197,7 +197,7 @@ def _summarise(console: Console, out: Path, metrics: dict[str, Any]) -> None:
             (
                 "ATE",
                 f"{truth['ate_rmse_m']:.3f} m RMSE over {truth['reference_length_m']:.1f} m "
-                f"({truth['evaluated_frame_count']} of {truth['reference_frame_count']} frames, Sim(3) aligned), "
+                f"({truth['matched_pose_count']} of {truth['reference_pose_count']} frames, Sim(3) aligned), "
                 f"drift {truth['drift_ate_percent']:.2f} %",
             )
         )

@@ -108,6 +108,16 @@ class ServiceWatch:
         with self._changed:
             return bool(self._changed.wait_for(lambda: not self._missing(names), timeout_s))
 
+    def wait_for_report(self, service: str, timeout_s: float) -> HealthReport | None:
+        """The first report of any instance of a service, or None if none comes in time."""
+
+        def newest() -> HealthReport | None:
+            reports = [report for (name, _), (report, _) in self._reports.items() if name == service]
+            return max(reports, key=lambda report: report.time_ns, default=None)
+
+        with self._changed:
+            return self._changed.wait_for(newest, timeout_s)
+
     def missing(self, names: Mapping[str, int]) -> dict[str, int]:
         """How many instances of each service are not there."""
         with self._changed:

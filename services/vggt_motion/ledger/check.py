@@ -37,6 +37,17 @@ class CheckReport:
         """Whether every acknowledged record and blob is there and whole."""
         return not self.problems
 
+    def to_text(self) -> str:
+        """The report for a person, one finding a line."""
+        records = ", ".join(f"{count} {stream}" for stream, count in sorted(self.record_counts.items())) or "none"
+        lines = [
+            f"{self.directory}: {'sound' if self.is_sound else 'DAMAGED'}",
+            f"records: {records}; {self.job_count} jobs; {self.blob_count} payloads; {self.stored_bytes} bytes",
+            *(f"repaired: {line}" for line in self.repaired),
+            *(f"problem: {line}" for line in self.problems),
+        ]
+        return "\n".join(lines) + "\n"
+
 
 def check(directory: Path, *, repair: bool = True) -> CheckReport:
     """Verify a session that nobody serves.

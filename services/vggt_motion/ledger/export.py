@@ -27,6 +27,10 @@ class ExportReport:
     blob_count: int
     archive_bytes: int
 
+    def __str__(self) -> str:
+        """One line for a person."""
+        return f"{sum(self.record_counts.values())} records, {self.blob_count} payloads, {self.archive_bytes} bytes"
+
 
 def export_session(directory: Path, archive: Path) -> ExportReport:
     """Write a session to a tar file; it may be served meanwhile, what comes later is not in it.

@@ -6,6 +6,7 @@ import contextlib
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 
@@ -54,6 +55,19 @@ class SessionSummary:
     is_ended: bool  # the run ended by itself
     is_in_use: bool  # a process serves it at this moment
     problem: str  # one line if it cannot be read; empty otherwise
+
+    def to_text(self) -> str:
+        """Two lines for a person: where it is and how far it got, and what it is of."""
+        state = self.problem or ("in use" if self.is_in_use else "finished" if self.is_ended else "unfinished")
+        counts = ", ".join(f"{self.record_counts.get(stream, 0)} {stream}s" for stream in ("keyframe", "submap"))
+        started = ""
+        if self.started_ns:
+            started = datetime.fromtimestamp(self.started_ns / 1e9, UTC).strftime(", started %Y-%m-%d %H:%M UTC")
+        dead = f", {self.dead_job_count} jobs given up" if self.dead_job_count else ""
+        return (
+            f"{self.directory}: {state}, {counts}{dead}, {self.stored_bytes / 1e6:.1f} MB{started}\n"
+            f"    {self.source or 'unknown source'}\n"
+        )
 
 
 def list_sessions(root: Path) -> list[SessionSummary]:
