@@ -81,16 +81,17 @@ def test_putting_heals_a_damaged_blob_that_nobody_has_read(blobs: BlobFiles, tmp
 
 
 def test_the_reserve_is_kept(tmp_path: Path) -> None:
-    free_bytes = 1000
+    free_bytes = 600
     store = BlobFiles(tmp_path / "blobs", free_bytes=lambda: free_bytes)
     store.put([bytes(400)], keep_free_bytes=600)
-    with pytest.raises(DiskFullError):
-        store.put([bytes(401)], keep_free_bytes=600)
-    with pytest.raises(DiskFullError):
-        store.put([bytes(200), b"\1" * 201], keep_free_bytes=600)
+    with pytest.raises(DiskFullError, match="no space for 601 bytes"):
+        store.put([bytes(300), b"\1" * 301], keep_free_bytes=600)
+    free_bytes = 599
+    with pytest.raises(DiskFullError, match="MiB left"):
+        store.put([b"one"], keep_free_bytes=600)
     assert list(store.names()) == [digest(bytes(400))]
-    free_bytes = 2000
-    store.put([bytes(401)], keep_free_bytes=600)
+    free_bytes = 600
+    store.put([b"one"], keep_free_bytes=600)
 
 
 def test_writes_at_the_same_time_do_not_overshoot_the_reserve_together(tmp_path: Path) -> None:

@@ -235,10 +235,12 @@ def test_below_the_reserve_no_job_is_handed_out_and_running_ones_may_finish(tmp_
     free_bytes = 900
     assert ledger.jobs.claim(PREDICT, (), "inference/b") is None
     result = record("submap", "a")
+    free_bytes = 499
     with pytest.raises(DiskFullError):
-        ledger.jobs.done("a", lease.lease_id, result, [bytes(401)])
+        ledger.jobs.done("a", lease.lease_id, result, [bytes(100)])
     assert state(ledger, "a") is JobState.LEASED
-    assert ledger.jobs.done("a", lease.lease_id, result, [bytes(400)]).outcome is DoneOutcome.COMMITTED
+    free_bytes = 500
+    assert ledger.jobs.done("a", lease.lease_id, result, [bytes(100)]).outcome is DoneOutcome.COMMITTED
     free_bytes = 1000
     assert claim(ledger).job.job_id == "b"
     ledger.close()

@@ -228,8 +228,13 @@ class BlobFiles:
     def _space(self, size_bytes: int, keep_free_bytes: int) -> Iterator[None]:
         with self._lock:
             free_bytes = self.free_bytes()
-            if free_bytes - self._claimed_bytes - size_bytes < keep_free_bytes:
+            # The state of the disk decides and not the size of what comes, so that what is refused is what
+            # `is_accepting` says: one write may dip into the reserve, many at once may not.
+            left_bytes = free_bytes - self._claimed_bytes
+            if left_bytes < keep_free_bytes:
                 raise DiskFullError(reserve_line(free_bytes, keep_free_bytes))
+            if left_bytes < size_bytes:
+                raise DiskFullError(f"the ledger's disk has no space for {size_bytes} bytes: {left_bytes} are left")
             self._claimed_bytes += size_bytes
         try:
             yield

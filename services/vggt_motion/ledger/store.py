@@ -224,7 +224,7 @@ class Blobs(Protocol):
         """Make blobs durable, in order; durable on return. Known ones are not stored twice.
 
         Raises:
-            DiskFullError: less than ``keep_free_bytes`` would be left, or there is no space.
+            DiskFullError: less than ``keep_free_bytes`` are free, or less than the blobs need.
         """
 
     def get(self, sha256: str) -> bytes:
