@@ -124,7 +124,7 @@ def write_results(
         keyframes=_component_track(trajectory.keyframes),
         frames=_component_track(trajectory.frames),
         ground_truth=truth,
-        cloud=None if cloud is None else PointCloud(cloud.points, cloud.colors, component),
+        cloud=None if cloud is None else PointCloud(cloud.points, cloud.colors, component, cloud.voxel),
         camera_view=_camera_view(state, trajectory, component, load_blob),
         metrics=metrics,
         warnings=tuple(metrics["warnings"]),

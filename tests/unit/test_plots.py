@@ -301,3 +301,13 @@ def test_camera_view_figure_sets_the_recorded_frame_beside_the_map() -> None:
     np.testing.assert_array_equal(first.images[0].get_array(), recorded)
     drawn = np.argwhere((np.asarray(second.images[0].get_array()) == (255, 0, 0)).all(axis=2))
     np.testing.assert_allclose(drawn.mean(axis=0), [(291 - 1) / 2, (960 - 1) / 2], atol=1.0)
+
+
+def test_points_are_drawn_as_large_as_the_voxels_that_made_them() -> None:
+    point, color = np.array([[0.0, 0.0, 5.0]]), np.array([[255, 0, 0]], np.uint8)
+    view = CameraView(0, np.eye(4), Intrinsics.centred(960.0, 960, 300))
+    areas = []
+    for size in (0.005, 0.026):  # 1 px and 5 px at that distance
+        image = map_plots.camera_view_figure(PointCloud(point, color, 0, size), view).axes[0].images[0].get_array()
+        areas.append(int((np.asarray(image) == color[0]).all(axis=2).sum()))
+    assert areas == [1, 25]

@@ -111,7 +111,9 @@ def camera_view_figure(cloud: PointCloud, view: CameraView) -> Figure:
 
 
 def _point_size(cloud: PointCloud, view: CameraView) -> float:
-    """Edge of a point in world units: about a pixel and a half at the median distance of what the camera sees."""
+    """Edge of a point in world units; where unknown, a pixel and a half at the median distance of what is seen."""
+    if cloud.point_size > 0.0:
+        return cloud.point_size
     offset = np.asarray(cloud.points, np.float64) - view.world_from_camera[:3, 3]
     depth = offset @ view.world_from_camera[:3, 2]
     seen = depth[np.isfinite(depth) & (depth > 0)]

@@ -117,7 +117,7 @@ def camera_view(
     points, colors = points[is_finite], colors[is_finite]
     in_camera = se3.act(se3.inverse(world_from_camera), np.asarray(points, np.float64))
     pixels = project(in_camera, intrinsics)
-    radius_limit = 2
+    radius_limit = 3
     keep = np.isfinite(pixels).all(axis=1) & (in_camera[:, 2] > point_size)
     keep &= (pixels[:, 0] > -radius_limit) & (pixels[:, 0] < intrinsics.width_px + radius_limit)
     keep &= (pixels[:, 1] > -radius_limit) & (pixels[:, 1] < intrinsics.height_px + radius_limit)

@@ -61,6 +61,7 @@ class PointCloud:
     points: npt.NDArray[np.floating]  # (N, 3), world units
     colors: npt.NDArray[np.uint8]  # (N, 3) RGB
     component: int = 0
+    point_size: float = 0.0  # edge of a point, world units (of the voxels that thinned the map); 0 = unknown
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.colors.shape != self.points.shape:
