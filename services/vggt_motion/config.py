@@ -55,9 +55,34 @@ class LedgerConfig(Section):
     retry_backoff_s: float = Field(0.5, ge=0, description="a failed job waits this long, doubled each time")
 
 
+# What VGGT-Long calls chunk 60 / overlap 30 is a base of 30 keyframes here, together with an overlap of 30.
+_FRONTEND_PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {"turning_score": "lateral", "turning_flow_px": 5.0, "parallax_px": 15.0},
+    "vggt_long": {
+        "selection": "dense",
+        "static_pruning": False,
+        "partition": "temporal",
+        "max_keyframes": 30,
+        "overlap_keyframes": 30,
+    },
+    "vggt_long_75": {
+        "selection": "dense",
+        "static_pruning": False,
+        "partition": "temporal",
+        "max_keyframes": 45,
+        "overlap_keyframes": 30,
+        "turn_max_keyframes": 45,
+    },
+}
+
+
 class FrontendConfig(Section):
     """Motion state, keyframes and partition (paper section 3.1, DESIGN 3.1 and 3.2)."""
 
+    preset: Literal["default", "paper", "vggt_long", "vggt_long_75"] = Field(
+        "default", description="values for all that is not set by itself: the paper's as printed, or VGGT-Long's chunks"
+    )
     flow_width_px: int = Field(
         320,
         ge=64,
@@ -89,10 +114,18 @@ class FrontendConfig(Section):
         180.0, gt=0, description="for partition = parallax: cumulative parallax of a submap"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in_preset(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        # an unknown name is refused by the field itself, with the names that there are
+        return {**_FRONTEND_PRESETS.get(str(data.get("preset", "default")), {}), **data}
+
     @model_validator(mode="after")
     def _orders(self) -> FrontendConfig:
-        if self.overlap_keyframes >= self.max_keyframes:
-            raise ValueError("overlap_keyframes must be smaller than max_keyframes")
+        if self.overlap_keyframes > self.max_keyframes:
+            raise ValueError("overlap_keyframes must not be larger than max_keyframes")
         if self.turn_max_keyframes < self.max_keyframes:
             raise ValueError("turn_max_keyframes must not be smaller than max_keyframes")
         return self
@@ -236,6 +269,9 @@ class RunConfig(Section):
     inference_workers: int = Field(1, ge=1, le=64)
     registration_workers: int = Field(1, ge=1, le=64)
     camera: str = Field("front", pattern=r"^[A-Za-z0-9_.-]{1,64}$")
+    nominal_rate_hz: float = Field(
+        10.0, gt=0, lt=1e5, description="frame rate of a folder or stream that says nothing about time"
+    )
 
 
 class Config(BaseSettings):

@@ -161,3 +161,19 @@ def test_left_a_turn_looks_at_keyframes_not_at_frames() -> None:
 
 def test_no_keyframes_no_segment() -> None:
     assert Partitioner(Topology(12, 5, 36), 5, camera="c", epoch=0).finish() is None
+
+
+@pytest.mark.parametrize(("preset", "chunk", "overlap"), [("vggt_long", 60, 30), ("vggt_long_75", 75, 30)])
+def test_preset_vggt_long_has_every_frame_in_fixed_chunks(preset: str, chunk: int, overlap: int) -> None:
+    config = FrontendConfig.model_validate({"preset": preset})
+    assert config.selection == "dense" and not config.static_pruning
+    segments = _partition([(T, True)] * 40 + [(L, True)] * 160, config)
+    for segment in segments[1:-1]:
+        assert len(segment.base_keyframe_ids) + len(segment.overlap_keyframe_ids) == chunk
+        assert len(segment.overlap_keyframe_ids) == overlap
+
+
+def test_what_is_set_by_itself_wins_over_the_preset() -> None:
+    config = FrontendConfig.model_validate({"preset": "paper", "parallax_px": 9.0})
+    assert (config.turning_score, config.turning_flow_px, config.parallax_px) == ("lateral", 5.0, 9.0)
+    assert FrontendConfig.model_validate(config.model_dump()) == config

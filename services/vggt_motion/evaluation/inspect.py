@@ -106,7 +106,7 @@ def inspect(
         SourceError: nothing readable in the source.
         InputError: ``out`` cannot be written.
     """
-    opened = open_source(source, start=start, end=end, stride=stride)
+    opened = open_source(source, start=start, end=end, stride=stride, nominal_rate_hz=config.run.nominal_rate_hz)
     collected = _Collected()
     pipeline = FrontendPipeline(config.frontend, config.run.camera, 0, ego_mask, on_trace=collected.traces.append)
     truncated = ""

@@ -62,7 +62,7 @@ def main(
         # DIS and the decoders gain nothing from threads at these sizes, and the other services need the cores
         cv2.setNumThreads(1)
         mask = None if ego_mask is None else EgoMask(ego_mask)
-        opened = _open(config, source, Selection(start, end, stride))
+        opened = _open(config, source, Selection(start, end, stride, config.run.nominal_rate_hz))
         with contextlib.closing(opened), _closed_on_stop(opened, context.stopping):
             _Frontend(context, opened, mask, publishes_frames=not is_on_bus(source)).run()
 
@@ -73,7 +73,13 @@ def _open(config: Config, location: str, selection: Selection) -> Source:
     if is_on_bus(location):
         # by itself that source would look for the bus in the environment only
         return open_zenoh(location, selection, config)
-    return open_source(location, start=selection.start, end=selection.end, stride=selection.stride)
+    return open_source(
+        location,
+        start=selection.start,
+        end=selection.end,
+        stride=selection.stride,
+        nominal_rate_hz=selection.nominal_rate_hz,
+    )
 
 
 class EgoMask:
