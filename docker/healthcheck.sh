@@ -13,4 +13,5 @@ config=$(words | awk 'previous == "--config" { print; exit } sub(/^--config=/, "
 [ -n "$service" ] || exit 0
 if [ -n "${HEALTHCHECK_ENDPOINT:-}" ]; then export VGGT_MOTION_BUS__ENDPOINT="$HEALTHCHECK_ENDPOINT"; fi
 if [ -n "$config" ]; then set -- --config "$config"; else set --; fi
-exec vggt-motion health "$service" "$@"
+# Well within the timeout of the image's HEALTHCHECK.
+exec vggt-motion health "$service" "$@" --set bus.connect_timeout_s=3 --timeout-s 4

@@ -114,16 +114,33 @@ def healthcheck(tmp_path: Path) -> Iterator[Any]:
     return run
 
 
+PATIENCE = "--set bus.connect_timeout_s=3 --timeout-s 4"
+
+
 def test_health_check_asks_for_the_service_of_this_container(healthcheck: Any) -> None:
     python, command = "/opt/vggt-motion/bin/python", "/opt/vggt-motion/bin/vggt-motion"
     for service in sorted(SERVICES):
         line = ("/sbin/docker-init", "--", python, command, "serve", service, "--directory", "/data/a b")
-        assert healthcheck(*line) == (0, f"tcp/router:7447|health {service}")
+        assert healthcheck(*line) == (0, f"tcp/router:7447|health {service} {PATIENCE}")
     assert healthcheck(python, command, "serve", "backend", "--config", "/etc/a b.yaml") == (
         0,
-        "tcp/router:7447|health backend --config /etc/a b.yaml",
+        f"tcp/router:7447|health backend --config /etc/a b.yaml {PATIENCE}",
     )
-    assert healthcheck(command, "serve", "ledger", "--config=/etc/rack.yaml")[1].endswith("--config /etc/rack.yaml")
+    assert healthcheck(command, "serve", "ledger", "--config=/etc/rack.yaml")[1].endswith(
+        f"--config /etc/rack.yaml {PATIENCE}"
+    )
+
+
+def test_health_check_asks_what_the_command_line_understands() -> None:
+    line = HEALTHCHECK.read_text(encoding="utf-8").splitlines()[-1]
+    words = line.replace('"$service"', "ledger").replace('"$@"', "--config /etc/rack.yaml").split()
+    parameters = parse_command(words[2:])
+    assert (parameters["service"], parameters["config"], parameters["timeout_s"]) == (
+        "ledger",
+        Path("/etc/rack.yaml"),
+        4,
+    )
+    assert parameters["assignments"] == ["bus.connect_timeout_s=3"]
 
 
 def test_health_check_passes_the_verdict_on(healthcheck: Any) -> None:
@@ -133,7 +150,7 @@ def test_health_check_passes_the_verdict_on(healthcheck: Any) -> None:
 
 def test_health_check_of_the_router_can_ask_elsewhere_than_it_listens(healthcheck: Any) -> None:
     code, asked = healthcheck("vggt-motion", "serve", "router", HEALTHCHECK_ENDPOINT="tls/router:7447")
-    assert (code, asked) == (0, "tls/router:7447|health router")
+    assert (code, asked) == (0, f"tls/router:7447|health router {PATIENCE}")
 
 
 # Compose
