@@ -162,13 +162,12 @@ def adjust(
 
 def shared_information(
     scene: Scene, observations: Observations, calibration: Calibration, robust_px: float, fixed_frame: int = 0
-) -> tuple[Array, float]:
+) -> Array:
     """Information (4, 4) of the shared camera from the observations alone, per square pixel of noise variance.
 
     Cameras and points are eliminated; the scale of the scene, which nothing can see, is held.
 
-    Returns:
-        the information, rows and columns of what is not refined are 0; and the sum of the robust weights.
+    Rows and columns of what is not refined are 0.
     """
     shared = scene.shared
     free = np.array(calibration.free)
@@ -196,8 +195,7 @@ def shared_information(
     information -= cross.T @ np.stack(columns, axis=1)
     information[~free] = 0.0
     information[:, ~free] = 0.0
-    squared = (residuals(scene, observations) ** 2).sum(axis=1)
-    return information, float((1.0 / (1.0 + squared / robust_px**2)).sum())
+    return np.asarray(information)
 
 
 def residuals(scene: Scene, observations: Observations) -> Array:

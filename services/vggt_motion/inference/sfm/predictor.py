@@ -16,6 +16,7 @@ from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Predi
 from vggt_motion.inference.sfm import depth as dense
 from vggt_motion.inference.sfm import images, rotation, structure, tracks, verdict
 from vggt_motion.inference.sfm.bundle import Scene
+from vggt_motion.inference.sfm.focal import CameraPrior
 from vggt_motion.inference.sfm.library import load_pycolmap
 from vggt_motion.records import FocalHint, ScaleKind, SubmapQuality, SubmapVerdict
 
@@ -94,7 +95,7 @@ class _Submap:
             return self._rotation_only(turned, working)
         # 4. structure
         started = time.perf_counter()
-        solved, attempts = structure.solve(followed, originals, working.width_px, working.height_px, self._prior())
+        solved, attempts = structure.solve(followed, originals, working, self._prior())
         self._attempts.extend(attempts)
         self._seconds["structure_s"] = time.perf_counter() - started
         if solved is None:
@@ -108,11 +109,11 @@ class _Submap:
         self._seconds["depth_s"] = time.perf_counter() - started
         return self._prediction(frames, judgement, reason, self._quality(solved, len(frames), working))
 
-    def _prior(self) -> structure.CameraPrior:
+    def _prior(self) -> CameraPrior:
         hint = self._hint
         if hint is None:
-            return structure.CameraPrior()
-        return structure.CameraPrior(hint.focal_over_width, hint.relative_sigma, hint.radial_k1, hint.is_fixed)
+            return CameraPrior()
+        return CameraPrior(hint.focal_over_width, hint.relative_sigma, hint.radial_k1, hint.is_fixed)
 
     def _frames(self, solved: structure.Structure, working: images.WorkingImages) -> tuple[PredictedFrame, ...]:
         width, height = images.fitted_size(working.width_px, working.height_px, self._config.sfm.depth_width_px)

@@ -8,49 +8,29 @@ unexplained.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.inference.sfm import bundle, growth
+from vggt_motion.inference.sfm import alignment, bundle, focal, growth
 from vggt_motion.inference.sfm.bundle import Calibration, Observations, Scene
+from vggt_motion.inference.sfm.focal import CameraPrior
+from vggt_motion.inference.sfm.images import GreyImage, WorkingImages
 from vggt_motion.inference.sfm.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-# Errors of tracks are alike in neighbouring frames and pixels (drift, moving things, distortion beyond one
-# coefficient): they carry less information than their scatter of 0.2 px suggests. With this deviation the focal lengths
-# of the evaluation drives lie within their stated uncertainty.
-PIXEL_SIGMA = 1.0
-_TYPICAL_FOCAL_OVER_WIDTH = 0.85
-_TYPICAL_FOCAL_LOG_SIGMA = 0.5
-_PRINCIPAL_SIGMA_OVER_WIDTH = 0.012
-_K1_SIGMA = 0.03
-_UNKNOWN_STARTS = (0.65, 1.1, 1.8)  # focal length / image width to grow from where nothing is known
-_LAST_USUAL_START = 1.5  # longer focal lengths are tried only where the others explain little
-_SURE_RELATIVE_SIGMA = 0.1  # a hint at least this sure is the only start
 _REGROW_RELATIVE = 0.12  # a focal length that moved so far is grown from once more
 _GOOD_EXPLAINED = 0.75  # share of observations that fit: no further start is tried
-_K1_GAIN = 0.05  # relative decrease of the cost for which a radial coefficient is believed
+_UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong distortion is believed
 _CAPPED_PX = 20.0
-_STAGES = (
-    (2.0, 12.0, 15, 1e-4),
-    (1.0, 5.0, 20, 1e-5),
-    (0.5, 2.5, 60, 1e-6),
-)  # kernel px, gate px, iterations, tolerance
-
-
-@dataclass(frozen=True)
-class CameraPrior:
-    """What is known about the camera before the submap is looked at."""
-
-    focal_over_width: float | None = None
-    relative_sigma: float = math.inf
-    radial_k1: float = 0.0
-    is_fixed: bool = False
+_MIN_FRAME_OBSERVATIONS = 15
+# kernel px, gate px, iterations, tolerance
+_STAGES = ((2.0, 12.0, 15, 1e-4), (1.0, 5.0, 20, 1e-4), (0.5, 2.5, 25, 1e-5))
+_POLISH = ((0.5, 2.5, 15, 1e-5), (0.3, 1.5, 60, 1e-6))
 
 
 @dataclass(frozen=True)
@@ -78,37 +58,77 @@ class Structure:
 
 
 def solve(
-    tracks: Tracks, positions: Sequence[int], width_px: int, height_px: int, prior: CameraPrior
+    tracks: Tracks, positions: Sequence[int], working: WorkingImages, prior: CameraPrior
 ) -> tuple[Structure | None, list[str]]:
     """Solve a submap.
+
+    Args:
+        tracks: through the frames at ``positions``.
+        positions: the frames in time order.
+        working: the images, by position.
+        prior: of the camera.
 
     Returns:
         the best solution, None where there is none; and one line for each way that was tried.
     """
-    centre = np.array([0.5 * (width_px - 1), 0.5 * (height_px - 1)])
+    width_px = working.width_px
+    centre = np.array([0.5 * (width_px - 1), 0.5 * (working.height_px - 1)])
     index = np.full(max(positions) + 1, -1)
     index[list(positions)] = np.arange(len(positions))
     observations = Observations.build(tracks.point, index[tracks.frame], tracks.pixel - centre, tracks.count)
+    calibration = prior.calibration(width_px)
     best: Structure | None = None
     attempts = []
-    for start in _starts(prior):
-        if best is not None and best.explained > _GOOD_EXPLAINED and (_is_sure(prior) or start > _LAST_USUAL_START):
+    for start, is_usual in prior.starts():
+        if best is not None and best.explained > _GOOD_EXPLAINED and (prior.is_sure or not is_usual):
             break
-        solved = _from_start(observations, positions, width_px, prior, start)
+        solved = _from_start(observations, positions, width_px, prior, calibration, start)
         attempts.append(f"grown from focal {start:.2f} widths: {_outcome(solved, width_px)}")
         best = _better(best, solved)
         if solved is None or solved is not best or not _is_worth_regrowing(solved, start, width_px, prior):
             continue
         moved = solved.scene.focal_px / width_px
-        again = _from_start(observations, positions, width_px, prior, moved)
+        again = _from_start(observations, positions, width_px, prior, calibration, moved)
         attempts.append(f"grown from focal {moved:.2f} widths: {_outcome(again, width_px)}")
         best = _better(best, again)
-    if best is not None and not prior.is_fixed:
-        distorted = _adjusted(observations, best.registered, positions, best.scene, width_px, prior, refine_k1=True)
-        if distorted is not None and distorted.cost < (1.0 - _K1_GAIN) * best.cost:
-            attempts.append(f"with a radial coefficient: {_outcome(distorted, width_px)}")
-            best = distorted
-    return (_in_unit_steps(best) if best is not None else None), attempts
+    if best is None:
+        return None, attempts
+    if not prior.is_fixed and best.registered.sum() > 2:
+        wide = prior.calibration(width_px, is_unrectified=True)
+        distorted = _adjusted(observations, best.registered, positions, best.scene, wide)
+        if distorted is not None and distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost:
+            attempts.append(f"with strong distortion: {_outcome(distorted, width_px)}")
+            best, calibration = distorted, wide
+    polished = _polished(best, observations, [working.grey[p] for p in positions], working.usable, calibration)
+    attempts.append(f"measured again: {_outcome(polished, width_px)}")
+    return _in_unit_steps(polished), attempts
+
+
+def _polished(
+    solved: Structure,
+    observations: Observations,
+    images: Sequence[GreyImage],
+    usable: npt.NDArray[np.bool_],
+    calibration: Calibration,
+) -> Structure:
+    """The structure on observations that were measured again where the scene says that they should be."""
+    scene, fitting = solved.scene, solved.observations
+    fixed = int(np.argmax(solved.registered))
+    for robust_px, gate_px, iterations, tolerance in _POLISH:
+        again = alignment.remeasure(scene, observations, fitting, solved.registered, images, usable)
+        rays = growth.rays_of(again, scene)
+        refined, fits = growth.retriangulate(scene, again, rays, solved.registered, robust_px, gate_px)
+        if np.bincount(fits.frame, minlength=len(solved.registered))[solved.registered].min() < _MIN_FRAME_OBSERVATIONS:
+            break
+        scene = bundle.adjust(
+            refined, fits, calibration, robust_px, focal.PIXEL_SIGMA, iterations, tolerance, fixed
+        ).scene
+        fitting = fits
+    return replace(
+        _described(scene, fitting, observations, solved.registered, solved.positions, calibration),
+        explained=solved.explained,
+        cost=solved.cost,
+    )
 
 
 def _is_worth_regrowing(solved: Structure, start: float, width_px: int, prior: CameraPrior) -> bool:
@@ -127,20 +147,6 @@ def _in_unit_steps(solved: Structure) -> Structure:
     return replace(solved, scene=replace(scene, translations=scene.translations / unit, points=scene.points / unit))
 
 
-def _is_sure(prior: CameraPrior) -> bool:
-    return prior.is_fixed or prior.relative_sigma < _SURE_RELATIVE_SIGMA
-
-
-def _starts(prior: CameraPrior) -> Iterator[float]:
-    known = prior.focal_over_width
-    if known is None:
-        yield from _UNKNOWN_STARTS
-        return
-    yield known
-    if not prior.is_fixed:
-        yield from sorted(_UNKNOWN_STARTS, key=lambda start: (start > _LAST_USUAL_START, -abs(math.log(start / known))))
-
-
 def _better(best: Structure | None, other: Structure | None) -> Structure | None:
     if best is None or other is None:
         return best or other
@@ -157,14 +163,19 @@ def _outcome(solved: Structure | None, width_px: int) -> str:
 
 
 def _from_start(
-    observations: Observations, positions: Sequence[int], width_px: int, prior: CameraPrior, focal_over_width: float
+    observations: Observations,
+    positions: Sequence[int],
+    width_px: int,
+    prior: CameraPrior,
+    calibration: Calibration,
+    focal_over_width: float,
 ) -> Structure | None:
     nothing = np.zeros((0, 3))
     camera = Scene(np.zeros((0, 3, 3)), nothing, nothing, focal_over_width * width_px, prior.radial_k1)
     grown = growth.grow(observations, len(positions), camera)
     if grown is None:
         return None
-    return _adjusted(observations, grown.registered, positions, grown.scene, width_px, prior, refine_k1=False)
+    return _adjusted(observations, grown.registered, positions, grown.scene, calibration)
 
 
 def _adjusted(
@@ -172,11 +183,8 @@ def _adjusted(
     registered: npt.NDArray[np.bool_],
     positions: Sequence[int],
     scene: Scene,
-    width_px: int,
-    prior: CameraPrior,
-    refine_k1: bool,
+    calibration: Calibration,
 ) -> Structure | None:
-    calibration = _calibration(prior, width_px, refine_k1)
     fixed = int(np.argmax(registered))
     fitting = observations
     for robust_px, gate_px, iterations, tolerance in _STAGES:
@@ -184,46 +192,34 @@ def _adjusted(
         scene, fitting = growth.retriangulate(scene, observations, rays, registered, robust_px, gate_px)
         if len(fitting.frame) < 4 * registered.sum():
             return None
-        scene = bundle.adjust(scene, fitting, calibration, robust_px, PIXEL_SIGMA, iterations, tolerance, fixed).scene
+        scene = bundle.adjust(
+            scene, fitting, calibration, robust_px, focal.PIXEL_SIGMA, iterations, tolerance, fixed
+        ).scene
+    return _described(scene, fitting, observations, registered, tuple(positions), calibration)
+
+
+def _described(
+    scene: Scene,
+    fitting: Observations,
+    observations: Observations,
+    registered: npt.NDArray[np.bool_],
+    positions: tuple[int, ...],
+    calibration: Calibration,
+) -> Structure:
     residuals = np.linalg.norm(bundle.residuals(scene, fitting), axis=1)
     everything = np.linalg.norm(bundle.residuals(scene, observations), axis=1)
-    information, _ = bundle.shared_information(scene, fitting, calibration, _STAGES[-1][0], fixed)
+    information = bundle.shared_information(scene, fitting, calibration, _STAGES[-1][0], int(np.argmax(registered)))
     return Structure(
-        positions=tuple(positions),
+        positions=positions,
         registered=registered,
         scene=scene,
         observations=fitting,
         explained=len(fitting.frame) / max(len(observations.frame), 1),
         reprojection_px=float(residuals.mean()),
         median_parallax_deg=_median_parallax_deg(scene, fitting),
-        focal_relative_sigma=_focal_sigma(information, calibration),
+        focal_relative_sigma=focal.relative_sigma(information, calibration),
         cost=float(np.log1p(np.minimum(everything, _CAPPED_PX) ** 2).sum()),
     )
-
-
-def _calibration(prior: CameraPrior, width_px: int, refine_k1: bool) -> Calibration:
-    principal = _PRINCIPAL_SIGMA_OVER_WIDTH * width_px
-    focal = prior.focal_over_width if prior.focal_over_width is not None else _TYPICAL_FOCAL_OVER_WIDTH
-    sigma = min(max(prior.relative_sigma, 1e-4), _TYPICAL_FOCAL_LOG_SIGMA)
-    return Calibration(
-        free=(not prior.is_fixed, refine_k1, not prior.is_fixed, not prior.is_fixed),
-        mean=(math.log(focal * width_px), prior.radial_k1, 0.0, 0.0),
-        sigma=(sigma, _K1_SIGMA, principal, principal),
-    )
-
-
-def _focal_sigma(information: Array, calibration: Calibration) -> float:
-    """Standard deviation of log focal from the observations; the other shared unknowns have their priors."""
-    free = np.flatnonzero(calibration.free)
-    if 0 not in free:
-        return math.inf
-    priors = np.array([0.0, *(1.0 / sigma**2 for sigma in calibration.sigma[1:])])
-    block = information[np.ix_(free, free)] / PIXEL_SIGMA**2 + np.diag(priors[free])
-    if not np.isfinite(block).all():
-        return math.inf
-    others = block[1:, 1:]
-    reduced = float(block[0, 0] - block[0, 1:] @ np.linalg.solve(others, block[1:, 0]))
-    return 1.0 / math.sqrt(reduced) if reduced > 1e-12 else math.inf
 
 
 def _median_parallax_deg(scene: Scene, observations: Observations) -> float:
