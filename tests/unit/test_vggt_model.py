@@ -16,7 +16,7 @@ from rule_weights import fixture_dir, rule_weights  # noqa: E402
 from vggt_motion.errors import InputError  # noqa: E402
 from vggt_motion.inference.vggt.architecture import SMALL, VGGT_1B, VggtArchitecture, architecture_of  # noqa: E402
 from vggt_motion.inference.vggt.dense_head import Fusion, add_position, axis_encoding  # noqa: E402
-from vggt_motion.inference.vggt.layers import Attention, Mlp, Rotary  # noqa: E402
+from vggt_motion.inference.vggt.layers import Block, Rotary  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
 
 # sha256 over the sorted lines "name shape" of the published 1B model's state dict and of the small configuration's
@@ -112,19 +112,19 @@ class TestRotary:
     def test_equals_complex_rotation(self) -> None:
         generator = torch.Generator().manual_seed(1)
         positions = torch.randint(0, 40, (7, 2), generator=generator)
-        x = torch.randn(2, 7, 3, 64, generator=generator)
+        x = torch.randn(7, 3, 64, generator=generator)
         turned = Rotary(positions, 64)(x).double().numpy()
         for axis in range(2):
             half = x[..., 32 * axis : 32 * axis + 32].double().numpy()
             number = half[..., :16] + 1j * half[..., 16:]
             angle = positions[:, axis].numpy()[:, None] * 100.0 ** (-2 * np.arange(16) / 32)
-            expected = number * np.exp(1j * angle)[None, :, None, :]
+            expected = number * np.exp(1j * angle)[:, None, :]
             np.testing.assert_allclose(turned[..., 32 * axis : 32 * axis + 16], expected.real, atol=1e-5)
             np.testing.assert_allclose(turned[..., 32 * axis + 16 : 32 * axis + 32], expected.imag, atol=1e-5)
 
     def test_products_depend_on_distance_only(self) -> None:
         generator = torch.Generator().manual_seed(2)
-        q, k = torch.randn(2, 1, 1, 1, 64, generator=generator)
+        q, k = torch.randn(2, 1, 1, 64, generator=generator)
 
         def product(at_q: tuple[int, int], at_k: tuple[int, int]) -> float:
             turned_q = Rotary(torch.tensor([at_q]), 64)(q)
@@ -134,7 +134,7 @@ class TestRotary:
         assert product((3, 5), (10, 1)) != pytest.approx(product((3, 5), (11, 1)), abs=1e-2)
 
     def test_origin_is_left_alone(self) -> None:
-        x = random_images(2, 5, 64)[0]
+        x = random_images(1, 5, 64)[0, 0]
         assert torch.equal(Rotary(torch.zeros(3, 2, dtype=torch.long), 64)(x), x)
 
 
@@ -165,23 +165,33 @@ class TestPositionEncoding:
 
 
 class TestParts:
-    def test_attention_equals_softmax(self) -> None:
-        torch.manual_seed(3)
-        attention = Attention(128, 2)
-        x = torch.randn(2, 5, 128)
-        q, k, v = attention.qkv(x).view(2, 5, 3, 2, 64).permute(2, 0, 3, 1, 4)
-        weights = torch.softmax(q @ k.transpose(-1, -2) / 8.0, dim=-1)
-        expected = attention.proj((weights @ v).transpose(1, 2).reshape(2, 5, 128))
-        torch.testing.assert_close(attention(x), expected, rtol=1e-5, atol=1e-5)
-
     @torch.inference_mode()
-    def test_mlp_chunks_do_not_change_the_result(self) -> None:
-        torch.manual_seed(4)
-        mlp = Mlp(8, 32, 5, token_chunk=3)
-        x = torch.randn(2, 7, 8)
-        chunked = mlp(x)
-        mlp.token_chunk = None
-        torch.testing.assert_close(chunked, mlp(x))
+    @pytest.mark.parametrize("row_chunk", [None, 1, 3, 4])
+    def test_block_equals_its_definition(self, row_chunk: int | None) -> None:
+        torch.manual_seed(3)
+        block = Block(128, 2, norm_eps=1e-5, normalise_queries=True)
+        for parameter in block.parameters():
+            torch.nn.init.normal_(parameter, std=0.2)
+        x = torch.randn(2, 5, 128)
+        rotary = Rotary(torch.arange(10).view(5, 2), 64)
+
+        normed = block.norm1(x)
+        q, k, v = block.attn.qkv(normed).view(2, 5, 3, 2, 64).unbind(2)
+        q, k = (
+            torch.stack([rotary(norm(sequence)) for sequence in rows])
+            for norm, rows in ((block.attn.q_norm, q), (block.attn.k_norm, k))
+        )
+        weights = torch.softmax(torch.einsum("bnhc,bmhc->bhnm", q, k) / 8.0, dim=-1)
+        attended = torch.einsum("bhnm,bmhc->bnhc", weights, v).reshape(2, 5, 128)
+        expected = x + block.ls1.gamma * block.attn.proj(attended)
+        hidden = block.mlp.fc1(block.norm2(expected))
+        hidden = 0.5 * hidden * (1 + torch.erf(hidden / math.sqrt(2)))  # the exact GELU
+        expected = expected + block.ls2.gamma * block.mlp.fc2(hidden)
+
+        block.row_chunk = row_chunk
+        stream = x.clone()
+        assert block(stream, rotary.repeated(2)) is stream
+        torch.testing.assert_close(stream, expected, rtol=1e-4, atol=1e-4)
 
     def test_convolution_before_resize_equals_after(self) -> None:
         torch.manual_seed(5)

@@ -62,7 +62,7 @@ class Aggregator(nn.Module):
         Args:
             images: (B, S, 3, H, W) RGB in [0, 1].
             wanted: level numbers; the others are not kept.
-            frame_chunk: frames that go through the patch embedding at a time.
+            frame_chunk: frames that go through patch embedding and frame attention at a time.
             stopwatch: takes the time of each part.
         """
         batch, frames = images.shape[:2]
@@ -71,10 +71,13 @@ class Aggregator(nn.Module):
             stream = self._embed(images, frame_chunk)
         token_count = stream.shape[1]
         rotary = Rotary(self._positions(rows, columns, stream.device), stream.shape[-1] // self.architecture.heads)
-        rotary_of_all = rotary.repeated(frames)
+        rotary_of_all = rotary.repeated(batch * frames)
         for index in range(self.architecture.depth):
             with stopwatch("frame_attention"):
-                stream = self.frame_blocks[index](stream.view(batch * frames, token_count, -1), rotary)
+                stream = stream.view(batch * frames, token_count, -1)
+                for start in range(0, batch * frames, frame_chunk):
+                    part = stream[start : start + frame_chunk]  # a view: the block writes to it
+                    self.frame_blocks[index](part, rotary.repeated(len(part)))
             of_frames = stream.clone() if index in wanted else None
             with stopwatch("global_attention"):
                 stream = self.global_blocks[index](stream.view(batch, frames * token_count, -1), rotary_of_all)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from vggt_motion.errors import InputError, MissingDependencyError
 from vggt_motion.inference.vggt.architecture import VggtArchitecture, architecture_of
+from vggt_motion.inference.vggt.layers import ACCELERATOR_ROW_CHUNK, CPU_ROW_CHUNK
 from vggt_motion.inference.vggt.model import Vggt
 
 _log = logging.getLogger(__name__)
@@ -136,6 +137,8 @@ def load_model(
             )
         state[name] = value.detach().to(device=device, dtype=inference_dtype(name, dtype))
     model.load_state_dict(state, strict=True, assign=True)
+    model.set_row_chunk(CPU_ROW_CHUNK if device.type == "cpu" else ACCELERATOR_ROW_CHUNK)
+    model.depth_head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model.eval().requires_grad_(False)
 
 

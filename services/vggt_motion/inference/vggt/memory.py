@@ -10,12 +10,12 @@ import torch
 
 from vggt_motion.errors import PredictionError
 from vggt_motion.inference.vggt.architecture import VggtArchitecture
+from vggt_motion.inference.vggt.layers import ACCELERATOR_ROW_CHUNK, CPU_ROW_CHUNK
 
 _FLOAT_BYTES = 4
 _MAX_FRAME_CHUNK = 16
 _CPU_FRAME_CHUNK = 2  # more frames at once are not faster on a CPU, only larger
-_MLP_TOKEN_CHUNK = 2048
-_LIBRARY_BYTES = 128 * 2**20  # packed operands of matrix products and convolutions
+_LIBRARY_BYTES = 96 * 2**20  # packed operands of matrix products and convolutions
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,12 @@ class MemoryPlan:
 
 
 def pass_bytes(
-    architecture: VggtArchitecture, frames: int, size: tuple[int, int], dtype: torch.dtype, frame_chunk: int
+    architecture: VggtArchitecture,
+    frames: int,
+    size: tuple[int, int],
+    dtype: torch.dtype,
+    frame_chunk: int,
+    row_chunk: int = CPU_ROW_CHUNK,
 ) -> int:
     """Upper estimate of the memory of one pass beyond the weights.
 
@@ -37,16 +42,17 @@ def pass_bytes(
         frames: B * S, all submaps of the batch.
         size: rows and columns of the network's images, pixels.
         dtype: of the transformer's matrix products.
-        frame_chunk: frames that patch embedding and dense heads take at a time.
+        frame_chunk: frames that patch embedding, frame attention and dense heads take at a time.
+        row_chunk: tokens that a block's matrix products take at a time.
     """
-    rows, columns = size[0] // architecture.patch_px, size[1] // architecture.patch_px
-    tokens = frames * (rows * columns + architecture.special_tokens)
+    patches = (size[0] // architecture.patch_px) * (size[1] // architecture.patch_px)
+    tokens = frames * (patches + architecture.special_tokens)
     width, item = architecture.width, dtype.itemsize
-    # Attention: stream, its norm, q k v, normed and turned q and k in float32 and in the dtype, result and projection.
-    attention = tokens * width * (2 * _FLOAT_BYTES + 5 * item + 3 * _FLOAT_BYTES)
-    mlp = tokens * width * (2 * _FLOAT_BYTES + 2 * item) + min(tokens, _MLP_TOKEN_CHUNK) * 8 * width * item
+    # A block: the stream, queries, keys, values, their result and its rearrangement; for the rows at hand, the hidden
+    # layer before and after its activation, or queries and keys on their way through norm and rotation.
+    rows = min(tokens, row_chunk)
+    block = tokens * width * (_FLOAT_BYTES + 5 * item) + rows * width * (8 * item + 6 * _FLOAT_BYTES)
     pixels = size[0] * size[1]
-    patches = rows * columns
     channels = sum(architecture.dense_channels)
     images_and_outputs = frames * pixels * _FLOAT_BYTES * (3 + 2)
     kept_maps = frames * patches * channels * _FLOAT_BYTES
@@ -56,7 +62,7 @@ def pass_bytes(
     fusion = patches * (channels + 16 * (architecture.dense_channels[0] + 5 * features) + 64 * 3 * features // 2)
     full = pixels * (features // 2 + 32 + 8) + patches * 64 * features // 2
     dense = frame_chunk * max(fusion, full) * _FLOAT_BYTES
-    return _LIBRARY_BYTES + images_and_outputs + kept_maps + max(kept_level + max(attention, mlp), dense) * 3 // 2
+    return _LIBRARY_BYTES + images_and_outputs + kept_maps + max(kept_level + block, dense) * 5 // 4
 
 
 def plan_pass(
@@ -74,9 +80,10 @@ def plan_pass(
     Raises:
         PredictionError: it does not fit however it is cut; the message has the numbers and what helps.
     """
+    row_chunk = CPU_ROW_CHUNK if is_cpu else ACCELERATOR_ROW_CHUNK
     largest = frame_chunk or min(frames, _CPU_FRAME_CHUNK if is_cpu else _MAX_FRAME_CHUNK)
     for chunk in range(largest, 0, -1):
-        required = pass_bytes(architecture, frames, size, dtype, chunk)
+        required = pass_bytes(architecture, frames, size, dtype, chunk, row_chunk)
         if required <= available:
             return MemoryPlan(chunk, required, available)
     raise PredictionError(

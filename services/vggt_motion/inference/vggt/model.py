@@ -11,6 +11,7 @@ from vggt_motion.inference.vggt.aggregator import Aggregator, Level
 from vggt_motion.inference.vggt.architecture import VggtArchitecture
 from vggt_motion.inference.vggt.camera_head import CameraHead
 from vggt_motion.inference.vggt.dense_head import DenseHead, activate_depth, activate_points
+from vggt_motion.inference.vggt.layers import Block
 from vggt_motion.inference.vggt.stopwatch import Stopwatch
 from vggt_motion.inference.vggt.tracking import TrackingHead
 
@@ -49,14 +50,20 @@ class Vggt(nn.Module):
             self.track_head = TrackingHead(architecture)
         self.with_points = with_points
 
+    def set_row_chunk(self, rows: int | None) -> None:
+        """Let all blocks work on so many tokens at a time; None = all. It does not change the result."""
+        for module in self.modules():
+            if isinstance(module, Block):
+                module.row_chunk = rows
+
     @torch.inference_mode()
     def forward(self, images: Tensor, frame_chunk: int = DEFAULT_FRAME_CHUNK) -> VggtOutput:
         """Predict B submaps of S frames each.
 
         Args:
             images: (B, S, 3, H, W) RGB in [0, 1], sides divisible by 14.
-            frame_chunk: frames that the patch embedding and the dense heads take at a time: it bounds the memory and
-                does not change the result.
+            frame_chunk: frames that patch embedding, frame attention and dense heads take at a time: it bounds the
+                memory and does not change the result.
         """
         batch, frames, _, height, width = images.shape
         stopwatch = Stopwatch(images.device)
@@ -102,7 +109,8 @@ class Vggt(nn.Module):
             part = slice(start, start + frame_chunk)
             narrow = head.project(position, level.tokens(part, patches), grid, size[1] / size[0])
             if result is None:
-                result = narrow.new_empty(count, *narrow.shape[1:])
+                shape = (count, *narrow.shape[1:])
+                result = torch.empty(shape, device=narrow.device, memory_format=torch.channels_last)
             result[part] = narrow
         assert result is not None
         return result
