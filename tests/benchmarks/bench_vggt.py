@@ -1,9 +1,9 @@
 """Memory and time of VGGT on this machine's CPU, beside a plain variant of the same network in the same run.
 
 The plain variant keeps the outputs of all levels, takes all frames and tokens at once everywhere and builds what a
-complete implementation has: depth and point heads, which it runs, and the tracking head's parameters. Weights are made by
-rule (rule_weights.py). Each measurement is a process of its own. The default is the published 1B network and needs up to
-10 GB and some minutes. Run: ``python tests/benchmarks/bench_vggt.py [--configuration small] [--json FILE]``.
+complete implementation has: depth and point heads, which it runs, and the tracking head's parameters. Weights are made
+by rule (rule_weights.py). Each measurement is a process of its own. The default is the published 1B network and needs
+up to 10 GB and some minutes. Run: ``python tests/benchmarks/bench_vggt.py [--configuration small] [--json FILE]``.
 """
 
 from __future__ import annotations

@@ -120,8 +120,8 @@ class LayerScale(nn.Module):
 class Block(nn.Module):
     """Pre-norm transformer block with LayerScale on both branches.
 
-    All but the attention itself works on ``row_chunk`` tokens at a time: what lies between two matrix products then stays
-    in the cache, and only queries, keys, values and their result are ever there for all tokens.
+    All but the attention itself works on ``row_chunk`` tokens at a time: what lies between two matrix products then
+    stays in the cache, and only queries, keys, values and their result are ever there for all tokens.
     """
 
     def __init__(self, width: int, heads: int, *, norm_eps: float, normalise_queries: bool = False):
