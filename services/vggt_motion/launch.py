@@ -327,7 +327,7 @@ class LocalRun:
             submaps=len(predicted),
             constraints=sum(1 for constraint in state.constraints.values() if constraint.accepted),
             state=newest.state if newest is not None else None,
-            lag_submaps=len(state.segments.keys() - predicted),
+            lag_submaps=len(state.unpredicted_segments()),
             dead_jobs=len(state.dead_jobs),
             is_input_complete=state.is_input_complete,
         )

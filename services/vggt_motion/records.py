@@ -16,6 +16,7 @@ import numpy.typing as npt
 from vggt_motion.geometry.projection import Intrinsics
 from vggt_motion.geometry.sim3 import Sim3
 
+SUBMAPS_PER_SEGMENT = 2  # one, or two halves
 
 class Stream(StrEnum):
     """The streams of the log (DESIGN section 4)."""
@@ -117,11 +118,18 @@ class FocalHint:
     is_fixed: bool = False  # given by the user: not to be refined
 
 
+class SubmapPart(StrEnum):
+    """Which half of a segment's base a submap holds, where the whole could not be predicted."""
+
+    FIRST_HALF = "first_half"
+    SECOND_HALF = "second_half"
+
+
 @dataclass(frozen=True)
 class SubmapSpec:
     """Composed submap M_k = O_k, R_k, L_k (paper eq. 4)."""
 
-    submap_index: int
+    submap_index: int  # orders the submaps along the drive, see :func:`submap_index`
     revision: int  # 1, or 2 when predicted again with a settled focal length
     overlap_keyframe_ids: tuple[str, ...]
     base_keyframe_ids: tuple[str, ...]
@@ -129,6 +137,7 @@ class SubmapSpec:
     zero_motion_copies: tuple[tuple[str, str], ...] = ()  # (copy, original), both of this submap
     focal_hint: FocalHint | None = None
     ego_mask: BlobRef | None = None
+    part: SubmapPart | None = None  # None = the whole base of its segment
 
     @property
     def keyframe_ids(self) -> tuple[str, ...]:
@@ -207,7 +216,7 @@ class SubmapGeometry:
     @property
     def record_id(self) -> str:
         """Identity in the log."""
-        return submap_id(self.spec.submap_index, self.spec.revision)
+        return submap_id(self.spec.submap_index, self.spec.revision, self.spec.part)
 
     def frame(self, keyframe_id: str) -> FrameGeometry | None:
         """The geometry of one keyframe, or None where the predictor did not register it."""
@@ -470,6 +479,9 @@ class HealthReport:
     counters: dict[str, float] = field(default_factory=dict)  # name with its unit -> value
 
 
+_PART_MARKS = {None: "", SubmapPart.FIRST_HALF: "a", SubmapPart.SECOND_HALF: "b"}
+
+
 def keyframe_id(camera: str, epoch: int, frame_index: int) -> str:
     """Id of a keyframe and its record."""
     return f"{camera}/{epoch}/{frame_index:08d}"
@@ -480,9 +492,22 @@ def segment_id(index: int) -> str:
     return f"segment/{index:06d}"
 
 
-def submap_id(index: int, revision: int) -> str:
-    """Record id of a submap's geometry, and of the job that predicts it."""
-    return f"submap/{index:06d}/r{revision}"
+def submap_index(segment_index: int, part: SubmapPart | None = None) -> int:
+    """Index of the submap of a segment; between two segments there is room for a second half."""
+    return SUBMAPS_PER_SEGMENT * segment_index + (part is SubmapPart.SECOND_HALF)
+
+
+def segment_index_of(submap_index: int) -> int:
+    """Index of the segment whose base, or half of it, a submap holds."""
+    return submap_index // SUBMAPS_PER_SEGMENT
+
+
+def submap_id(index: int, revision: int, part: SubmapPart | None = None) -> str:
+    """Record id of a submap's geometry, and of the job that predicts it.
+
+    The first half of a base has the index of the whole and so a mark, to be another job than the one that is dead.
+    """
+    return f"submap/{index:06d}{_PART_MARKS[part]}/r{revision}"
 
 
 def constraint_id(kind: ConstraintKind, i: int, i_revision: int, j: int, j_revision: int) -> str:

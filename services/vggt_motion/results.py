@@ -262,7 +262,7 @@ def _metrics(
     graph = state.latest_graph()
     ended = state.stream_ended
     hint = focal.fold(
-        state.submaps[index, 1].quality if (index, 1) in state.submaps else None for index in sorted(state.segments)
+        geometry.quality for (_, revision), geometry in sorted(state.submaps.items()) if revision == 1
     ).hint()
     states = Counter(frame.state.name.lower() for frame in trajectory.frames)
     unit = "m" if has_metres else "units"

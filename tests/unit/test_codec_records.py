@@ -50,6 +50,7 @@ from vggt_motion.records import (
     Stream,
     StreamPosition,
     SubmapGeometry,
+    SubmapPart,
     SubmapPose,
     SubmapQuality,
     SubmapSpec,
@@ -134,7 +135,7 @@ def submap_specs(draw: st.DrawFn) -> SubmapSpec:
     hint = st.builds(FocalHint, positive, untold.filter(lambda value: not math.isnan(value)), finite, st.booleans())
     return SubmapSpec(
         draw(indices), draw(st.integers(1, 9)), tuple(ids[:first]), tuple(ids[first:second]), tuple(ids[second:]),
-        copies, draw(st.none() | hint), draw(st.none() | blob_refs),
+        copies, draw(st.none() | hint), draw(st.none() | blob_refs), draw(st.none() | st.sampled_from(SubmapPart)),
     )  # fmt: skip
 
 

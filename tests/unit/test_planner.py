@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import random
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vggt_motion.backend import focal, planner
+from vggt_motion.backend import focal, planner, posegraph
 from vggt_motion.backend.state import LogState
 from vggt_motion.config import Config, load_config
 from vggt_motion.geometry.projection import Intrinsics
@@ -31,6 +32,8 @@ from vggt_motion.records import (
     SubmapQuality,
     SubmapSpec,
     SubmapVerdict,
+    submap_id,
+    submap_index,
 )
 
 BLOB = BlobRef("0" * 64, 1, "image/jpeg")
@@ -71,10 +74,14 @@ def dead(job_id: str) -> Event:
     return Event(f"job_dead/{job_id}", EventKind.JOB_DEAD, "gave up", 0, {"job_id": job_id})
 
 
-def started(segment_count: int, *, ended: bool = True) -> LogState:
+def whole(segment_index: int, revision: int = 1) -> str:
+    return submap_id(submap_index(segment_index), revision)
+
+
+def started(segment_count: int, *, base: int = 4, ended: bool = True) -> LogState:
     state = LogState()
     for index in range(segment_count):
-        entry = segment(index)
+        entry = segment(index, base, min(2, base))
         state.apply(entry)
         for name in entry.base_keyframe_ids:
             state.apply(keyframe(int(name.rsplit("/", 1)[1])))
@@ -102,13 +109,13 @@ def run(
     dead_share: float = 0.0,
 ) -> None:
     """Carry out whatever is planned, one job at a time in random order, until nothing is left."""
-    doomed = {f"submap/{index:06d}/r1" for index in range(100) if (index * 7919) % 100 < 100 * dead_share}
     for _ in range(10_000):
         jobs = planner.next_jobs(state, CONFIG)
         if not jobs:
             return
         job = order.choice(jobs)
-        state.apply(dead(job.job_id) if job.job_id in doomed else result(job, focals or {}, sigma))
+        is_doomed = zlib.crc32(job.job_id.encode()) % 100 < 100 * dead_share
+        state.apply(dead(job.job_id) if is_doomed else result(job, focals or {}, sigma))
     raise AssertionError("the plan does not end")
 
 
@@ -121,14 +128,14 @@ def test_a_segment_without_its_keyframes_waits() -> None:
 def test_the_hint_of_submap_k_folds_submaps_0_to_k_minus_3() -> None:
     state = started(6)
     first = planner.next_jobs(state, CONFIG)
-    assert [job.job_id for job in first] == [f"submap/{k:06d}/r1" for k in range(3)]
+    assert [job.job_id for job in first] == [whole(k) for k in range(3)]
     assert all(isinstance(job.task, PredictTask) and job.task.spec.focal_hint is None for job in first)
     # 2 before 0: submap 3 has to wait for 0 all the same.
     assert isinstance(first[2].task, PredictTask) and isinstance(first[0].task, PredictTask)
     state.apply(geometry(first[2].task.spec, 0.7))
-    assert "submap/000003/r1" not in {job.job_id for job in planner.next_jobs(state, CONFIG)}
+    assert whole(3) not in {job.job_id for job in planner.next_jobs(state, CONFIG)}
     state.apply(geometry(first[0].task.spec, 0.6))
-    third = next(job for job in planner.next_jobs(state, CONFIG) if job.job_id == "submap/000003/r1")
+    third = next(job for job in planner.next_jobs(state, CONFIG) if job.job_id == whole(3))
     assert isinstance(third.task, PredictTask) and third.task.spec.focal_hint is not None
     assert third.task.spec.focal_hint.focal_over_width == pytest.approx(0.6)
 
@@ -180,15 +187,89 @@ def test_submaps_that_the_settled_estimate_contradicts_are_predicted_once_more()
     assert used is not None and used.quality.focal_over_width < 0.65
     assert planner.is_complete(state, CONFIG)
     revisions = {(c.spec.i, c.spec.i_revision, c.spec.j, c.spec.j_revision) for c in planner.current_constraints(state)}
-    assert revisions == {(0, 2, 1, 1)} | {(k, 1, k + 1, 1) for k in range(1, 7)}
+    assert revisions == {(0, 2, 2, 1)} | {(2 * k, 1, 2 * k + 2, 1) for k in range(1, 7)}
+
+
+def edges(state: LogState) -> set[tuple[int, int]]:
+    return {(c.spec.i, c.spec.j) for c in planner.current_constraints(state)}
+
+
+def test_a_dead_submap_is_predicted_in_two_overlapping_halves() -> None:
+    state = started(5, base=7)
+    state.apply(dead(whole(2)))
+    ids = {job.job_id: job for job in planner.next_jobs(state, CONFIG)}
+    assert whole(2) not in ids
+    first, second = (ids[name].task for name in ("submap/000004a/r1", "submap/000005b/r1"))
+    assert isinstance(first, PredictTask) and isinstance(second, PredictTask)
+    entry = state.segments[2]
+    assert first.spec.overlap_keyframe_ids == entry.overlap_keyframe_ids
+    assert first.spec.base_keyframe_ids == entry.base_keyframe_ids[:4]
+    assert second.spec.overlap_keyframe_ids == entry.base_keyframe_ids[:4]
+    assert second.spec.base_keyframe_ids == entry.base_keyframe_ids[4:]
+    assert [k.keyframe_id for k in second.keyframes] == list(second.spec.keyframe_ids)
+    run(state, random.Random(0))
+    assert planner.is_complete(state, CONFIG)
+    assert edges(state) == {(0, 2), (2, 4), (4, 5), (5, 6), (6, 8)}
+    assert state.unpredicted_segments() == set()
+    graph = posegraph.solve(
+        [(i, g.spec.revision) for i, g in state.usable_submaps().items()],
+        planner.current_constraints(state), CONFIG.backend, revision=1, is_final=True,
+    )  # fmt: skip
+    assert graph.breaks == () and {pose.component for pose in graph.poses} == {0}
+
+
+@pytest.mark.parametrize(
+    ("half", "kept", "broken_before"),
+    [
+        ("submap/000004a/r1", {(0, 2), (5, 6), (6, 8)}, 5),
+        ("submap/000005b/r1", {(0, 2), (2, 4), (6, 8)}, 6),
+    ],
+)
+def test_the_graph_breaks_where_a_half_is_dead_too(half: str, kept: set[tuple[int, int]], broken_before: int) -> None:
+    state = started(5)
+    state.apply(dead(whole(2)))
+    state.apply(dead(half))
+    run(state, random.Random(0))
+    assert planner.is_complete(state, CONFIG)
+    assert edges(state) == kept
+    graph = posegraph.solve(
+        [(i, g.spec.revision) for i, g in state.usable_submaps().items()],
+        planner.current_constraints(state), CONFIG.backend, revision=1, is_final=True,
+    )  # fmt: skip
+    assert len(graph.breaks) == 1 and f"before submap {broken_before}:" in graph.breaks[0]
+
+
+def test_a_base_of_one_keyframe_has_no_halves() -> None:
+    state = started(3, base=1)
+    state.apply(dead(whole(1)))
+    run(state, random.Random(0))
+    assert planner.is_complete(state, CONFIG)
+    assert sorted(index for index, _ in state.submaps) == [0, 4]
+    assert edges(state) == set()
 
 
 def test_a_dead_submap_does_not_hold_up_the_others() -> None:
     state = started(9)
-    state.apply(dead("submap/000004/r1"))
-    run(state, random.Random(0))
+    state.apply(dead(whole(4)))
+    for _ in range(100):
+        jobs = [job for job in planner.next_jobs(state, CONFIG) if "/000008a" not in job.job_id]
+        jobs = [job for job in jobs if "/000009b" not in job.job_id]
+        if not jobs:
+            break
+        state.apply(result(jobs[0], {}, 0.02))
+    # All others are there while nobody takes the halves.
+    assert sorted(index for index, _ in state.submaps) == [0, 2, 4, 6, 10, 12, 14, 16]
+    assert not planner.is_complete(state, CONFIG)
+
+
+def test_a_half_that_the_settled_estimate_contradicts_is_predicted_once_more() -> None:
+    state = started(8)
+    state.apply(dead(whole(1)))
+    run(state, random.Random(0), {2: 0.7}, sigma=0.01)
+    assert {key for key in state.submaps if key[1] == 2} == {(2, 2)}
+    assert state.submaps[2, 2].record_id == "submap/000002a/r2"
     assert planner.is_complete(state, CONFIG)
-    assert sorted(index for index, _ in state.submaps) == [0, 1, 2, 3, 5, 6, 7, 8]
+    assert edges(state) == {(0, 2), (2, 3), (3, 4)} | {(2 * k, 2 * k + 2) for k in range(2, 7)}
 
 
 def test_a_failed_submap_is_not_registered() -> None:
@@ -197,10 +278,10 @@ def test_a_failed_submap_is_not_registered() -> None:
         assert isinstance(job.task, PredictTask)
         done = geometry(job.task.spec)
         failed = replace(done, verdict=SubmapVerdict.FAILED, frames=(), reason="no texture")
-        state.apply(failed if job.task.spec.submap_index == 1 else done)
+        state.apply(failed if job.task.spec.submap_index == 2 else done)
     assert planner.next_jobs(state, CONFIG) == []
     assert planner.is_complete(state, CONFIG)
-    assert sorted(state.usable_submaps()) == [0, 2]
+    assert sorted(state.usable_submaps()) == [0, 4]
 
 
 def test_not_complete_before_the_input_is_closed() -> None:
@@ -214,17 +295,18 @@ def test_not_complete_before_the_input_is_closed() -> None:
     seed=st.integers(0, 2**32),
     count=st.integers(1, 12),
     sigma=st.floats(0.002, 0.3),
-    focals=st.dictionaries(st.integers(0, 11), st.floats(0.4, 0.9), max_size=6),
-    dead_share=st.sampled_from([0.0, 0.2]),
+    focals=st.dictionaries(st.integers(0, 23), st.floats(0.4, 0.9), max_size=6),
+    dead_share=st.sampled_from([0.0, 0.2, 0.6]),
+    base=st.integers(1, 7),
 )
 def test_the_outcome_does_not_depend_on_who_is_faster(
-    seed: int, count: int, sigma: float, focals: dict[int, float], dead_share: float
+    seed: int, count: int, sigma: float, focals: dict[int, float], dead_share: float, base: int
 ) -> None:
     outcomes = []
     for order in (random.Random(seed), random.Random(seed + 1)):
-        state = started(count, ended=False)
+        state = started(count, base=base, ended=False)
         run(state, order, focals, sigma, dead_share)
-        state.apply(started(count).events["stream_ended"])
+        state.apply(started(count, base=base).events["stream_ended"])
         run(state, order, focals, sigma, dead_share)
         assert planner.is_complete(state, CONFIG)
         specs = {key: value.spec for key, value in state.submaps.items()}

@@ -60,6 +60,7 @@ ENUMS: list[tuple[type[StrEnum], EnumDescriptor]] = [
     (records.MotionState, keyframe_pb2.MotionState.DESCRIPTOR),
     (records.DropReason, segment_pb2.DropReason.DESCRIPTOR),
     (records.ScaleKind, submap_pb2.ScaleKind.DESCRIPTOR),
+    (records.SubmapPart, submap_pb2.SubmapPart.DESCRIPTOR),
     (records.SubmapVerdict, submap_pb2.SubmapVerdict.DESCRIPTOR),
     (records.DepthCodec, submap_pb2.DepthCodec.DESCRIPTOR),
     (records.ConstraintKind, constraint_pb2.ConstraintKind.DESCRIPTOR),

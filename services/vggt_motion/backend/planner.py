@@ -2,6 +2,8 @@
 
 - a segment closed: predict its submap, once the results that its focal hint folds (submaps 0 to k-3) are known;
 - the focal estimate settled: predict submaps that it contradicts once more, as revision 2;
+- a submap cannot be predicted (its job is dead): predict the two halves of its base, which overlap; where a half is
+  dead too, the graph breaks;
 - two neighbours predicted: register them.
 """
 
@@ -9,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 from vggt_motion.backend import focal
 from vggt_motion.backend.state import LogState
@@ -22,12 +25,15 @@ from vggt_motion.records import (
     RegisterTask,
     RegistrationSpec,
     ScaleKind,
+    Segment,
     SharedGeometry,
     SubmapGeometry,
+    SubmapPart,
     SubmapQuality,
     SubmapSpec,
     constraint_id,
     submap_id,
+    submap_index,
 )
 
 # Submap k gets the fold of submaps 0 .. k - HINT_LAG: up to HINT_LAG submaps can be predicted at the same time.
@@ -59,12 +65,68 @@ def is_complete(state: LogState, config: Config) -> bool:
     return state.is_input_complete and not next_jobs(state, config)
 
 
-def _is_resolved(state: LogState, index: int, revision: int) -> bool:
-    return (index, revision) in state.submaps or submap_id(index, revision) in state.dead_jobs
+@dataclass(frozen=True)
+class _Composition:
+    """A submap as the log calls for it: a whole base, or half of one whose whole is dead."""
+
+    segment: Segment
+    part: SubmapPart | None
+    overlap_keyframe_ids: tuple[str, ...]
+    base_keyframe_ids: tuple[str, ...]
+
+    @property
+    def index(self) -> int:
+        return submap_index(self.segment.index, self.part)
 
 
-def _quality(state: LogState, index: int) -> SubmapQuality | None:
-    geometry = state.submaps.get((index, 1))
+def _whole(segment: Segment) -> _Composition:
+    return _Composition(segment, None, segment.overlap_keyframe_ids, segment.base_keyframe_ids)
+
+
+def _halves(segment: Segment, config: Config) -> list[_Composition]:
+    """The base in two, the second of which begins with the end of the first as its overlap; none of a single keyframe.
+
+    A later submap shares the end of the base, so that it is neighbour to the second half as it was to the whole.
+    """
+    base = segment.base_keyframe_ids
+    middle = (len(base) + 1) // 2
+    first, second = base[:middle], base[middle:]
+    if not second:
+        return []
+    shared = first[-config.frontend.overlap_keyframes :]
+    return [
+        _Composition(segment, SubmapPart.FIRST_HALF, segment.overlap_keyframe_ids, first),
+        _Composition(segment, SubmapPart.SECOND_HALF, shared, second),
+    ]
+
+
+def _compositions(state: LogState, config: Config, segment: Segment) -> list[_Composition]:
+    """The submaps of a segment: the whole, or its halves once the whole is dead."""
+    whole = _whole(segment)
+    return _halves(segment, config) if _is_dead(state, whole, 1) else [whole]
+
+
+def _all_compositions(state: LogState, config: Config) -> list[_Composition]:
+    """The submaps of all segments, along the drive."""
+    return [c for index in sorted(state.segments) for c in _compositions(state, config, state.segments[index])]
+
+
+def _is_dead(state: LogState, composition: _Composition, revision: int) -> bool:
+    return submap_id(composition.index, revision, composition.part) in state.dead_jobs
+
+
+def _geometry(state: LogState, composition: _Composition, revision: int) -> SubmapGeometry | None:
+    geometry = state.submaps.get((composition.index, revision))
+    # The whole and its first half have one index.
+    return geometry if geometry is not None and geometry.spec.part is composition.part else None
+
+
+def _is_resolved(state: LogState, composition: _Composition, revision: int) -> bool:
+    return _geometry(state, composition, revision) is not None or _is_dead(state, composition, revision)
+
+
+def _quality(state: LogState, composition: _Composition) -> SubmapQuality | None:
+    geometry = _geometry(state, composition, 1)
     return geometry.quality if geometry is not None else None
 
 
@@ -81,42 +143,46 @@ def _predictions(state: LogState, config: Config) -> Iterator[PlannedJob]:
     for index in sorted(state.segments):
         newest = index - HINT_LAG
         if given is None and newest >= 0:
-            if not _is_resolved(state, newest, 1):
+            # Only wholes are folded: nobody waits for the halves of a submap that cannot be predicted.
+            whole = _whole(state.segments[newest])
+            if not _is_resolved(state, whole, 1):
                 break
-            estimate.add(_quality(state, newest))
-        if not _is_resolved(state, index, 1):
-            yield from _predict_job(state, index, 1, given or estimate.hint())
-    for index, hint in _second_predictions(state, config).items():
-        if not _is_resolved(state, index, 2):
-            yield from _predict_job(state, index, 2, hint)
+            estimate.add(_quality(state, whole))
+        for composition in _compositions(state, config, state.segments[index]):
+            if not _is_resolved(state, composition, 1):
+                yield from _predict_job(state, composition, 1, given or estimate.hint())
+    for composition, hint in _second_predictions(state, config).items():
+        if not _is_resolved(state, composition, 2):
+            yield from _predict_job(state, composition, 2, hint)
 
 
-def _second_predictions(state: LogState, config: Config) -> dict[int, FocalHint]:
+def _second_predictions(state: LogState, config: Config) -> dict[_Composition, FocalHint]:
     """Submaps whose focal length is contradicted by the estimate at the moment that it settled, with that estimate."""
     decision = _settled_estimate(state) if config.inference.focal_over_width is None else None
     if decision is None:
         return {}
     settled_at, hint = decision
     contradicted = {}
-    for index in range(min(settled_at + HINT_LAG, len(state.segments))):
-        quality = _quality(state, index)
-        if quality is None or not quality.focal_over_width > 0.0:
+    for composition in _all_compositions(state, config):
+        quality = _quality(state, composition)
+        if composition.segment.index >= settled_at + HINT_LAG or quality is None or not quality.focal_over_width > 0.0:
             continue
         if abs(quality.focal_over_width / hint.focal_over_width - 1.0) > MAX_FOCAL_DEVIATION:
-            contradicted[index] = hint
+            contradicted[composition] = hint
     return contradicted
 
 
 def _settled_estimate(state: LogState) -> tuple[int, FocalHint] | None:
-    """Index of the submap with which the fold settled, and the estimate at that point; the same on every run.
+    """Index of the segment with which the fold settled, and the estimate at that point; the same on every run.
 
     A stream that ends before that is judged by all it has.
     """
     estimate = focal.FocalEstimate()
     for index in sorted(state.segments):
-        if not _is_resolved(state, index, 1):
+        whole = _whole(state.segments[index])
+        if not _is_resolved(state, whole, 1):
             return None
-        estimate.add(_quality(state, index))
+        estimate.add(_quality(state, whole))
         hint = estimate.settled_hint()
         if hint is not None:
             return index, hint
@@ -127,9 +193,10 @@ def _settled_estimate(state: LogState) -> tuple[int, FocalHint] | None:
     return len(state.segments) - 1, hint
 
 
-def _predict_job(state: LogState, index: int, revision: int, hint: FocalHint | None) -> Iterator[PlannedJob]:
-    segment = state.segments[index]
-    members = segment.overlap_keyframe_ids + segment.base_keyframe_ids
+def _predict_job(
+    state: LogState, composition: _Composition, revision: int, hint: FocalHint | None
+) -> Iterator[PlannedJob]:
+    members = composition.overlap_keyframe_ids + composition.base_keyframe_ids
     if any(keyframe_id not in state.keyframes for keyframe_id in members):
         return  # the streams are followed apart: the keyframes are on their way
     keyframes = tuple(state.keyframes[keyframe_id] for keyframe_id in members)
@@ -138,16 +205,18 @@ def _predict_job(state: LogState, index: int, revision: int, hint: FocalHint | N
         for keyframe in keyframes
         if keyframe.zero_motion_copy_of is not None and keyframe.zero_motion_copy_of in members
     )
+    index, part = composition.index, composition.part
     spec = SubmapSpec(
         submap_index=index,
         revision=revision,
-        overlap_keyframe_ids=segment.overlap_keyframe_ids,
-        base_keyframe_ids=segment.base_keyframe_ids,
+        overlap_keyframe_ids=composition.overlap_keyframe_ids,
+        base_keyframe_ids=composition.base_keyframe_ids,
         zero_motion_copies=copies,
         focal_hint=hint,
-        ego_mask=segment.ego_mask,
+        ego_mask=composition.segment.ego_mask,
+        part=part,
     )
-    yield PlannedJob(submap_id(index, revision), JobKind.PREDICT, PredictTask(spec, keyframes), priority=index)
+    yield PlannedJob(submap_id(index, revision, part), JobKind.PREDICT, PredictTask(spec, keyframes), priority=index)
 
 
 def _registrations(state: LogState, config: Config) -> Iterator[PlannedJob]:
@@ -157,14 +226,18 @@ def _registrations(state: LogState, config: Config) -> Iterator[PlannedJob]:
     certain which these are. So the set of constraints does not depend on who was faster.
     """
     second = _second_predictions(state, config)
-    for j in sorted(state.segments):
-        i = j - 1
-        if i not in state.segments:
-            continue
-        yield from _register_job(state, state.submaps.get((i, 1)), state.submaps.get((j, 1)))
+    for i, j in pairwise(_all_compositions(state, config)):
+        if j.segment.index > i.segment.index + 1:
+            continue  # the segment between them is on its way, or had a single keyframe and is dead
+        yield from _register_job(state, _geometry(state, i, 1), _geometry(state, j, 1))
         is_certain = all(_is_resolved(state, k, 2) for k in (i, j) if k in second)
         if is_certain and not {i, j}.isdisjoint(second):
-            yield from _register_job(state, state.submap(i), state.submap(j))
+            yield from _register_job(state, _newest_usable(state, i), _newest_usable(state, j))
+
+
+def _newest_usable(state: LogState, composition: _Composition) -> SubmapGeometry | None:
+    geometry = state.submap(composition.index)
+    return geometry if geometry is not None and geometry.spec.part is composition.part else None
 
 
 def _register_job(

@@ -13,6 +13,7 @@ from vggt_motion.records import (
     Segment,
     SubmapGeometry,
     SubmapVerdict,
+    segment_index_of,
 )
 
 MAX_REVISION = 2  # a submap is predicted at most once more, with a settled focal length
@@ -65,6 +66,10 @@ class LogState:
         """Whether the input is closed and every segment that it promised is here."""
         ended = self.stream_ended
         return ended is not None and len(self.segments) >= int(ended.detail.get("segment_count", "0"))
+
+    def unpredicted_segments(self) -> set[int]:
+        """Indices of the closed segments that no submap came of yet."""
+        return self.segments.keys() - {segment_index_of(index) for index, _ in self.submaps}
 
     def latest_graph(self) -> GraphUpdate | None:
         """The final graph, or else the newest live one."""

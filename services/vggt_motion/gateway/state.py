@@ -361,7 +361,7 @@ class GatewayState:
         return LagStatus(
             keyframes=max(0, len(self._log.keyframes) - self._optimised_keyframes),
             video_s=video_s,
-            submaps=len(self._log.segments.keys() - self._verdicts.keys()),
+            submaps=len(self._log.unpredicted_segments()),
             jobs_waiting=waiting,
         )
 

@@ -26,6 +26,12 @@ class DepthCodec(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     DEPTH_CODEC_UNSPECIFIED: _ClassVar[DepthCodec]
     DEPTH_CODEC_F16_SHUFFLE_ZSTD: _ClassVar[DepthCodec]
+
+class SubmapPart(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SUBMAP_PART_UNSPECIFIED: _ClassVar[SubmapPart]
+    SUBMAP_PART_FIRST_HALF: _ClassVar[SubmapPart]
+    SUBMAP_PART_SECOND_HALF: _ClassVar[SubmapPart]
 SCALE_KIND_UNSPECIFIED: ScaleKind
 SCALE_KIND_RELATIVE: ScaleKind
 SCALE_KIND_METRIC: ScaleKind
@@ -36,6 +42,9 @@ SUBMAP_VERDICT_ROTATION_ONLY: SubmapVerdict
 SUBMAP_VERDICT_FAILED: SubmapVerdict
 DEPTH_CODEC_UNSPECIFIED: DepthCodec
 DEPTH_CODEC_F16_SHUFFLE_ZSTD: DepthCodec
+SUBMAP_PART_UNSPECIFIED: SubmapPart
+SUBMAP_PART_FIRST_HALF: SubmapPart
+SUBMAP_PART_SECOND_HALF: SubmapPart
 
 class FocalHint(_message.Message):
     __slots__ = ("focal_over_width", "relative_sigma", "radial_k1", "is_fixed")
@@ -58,7 +67,7 @@ class ZeroMotionCopy(_message.Message):
     def __init__(self, copy_keyframe_id: _Optional[str] = ..., original_keyframe_id: _Optional[str] = ...) -> None: ...
 
 class SubmapSpec(_message.Message):
-    __slots__ = ("schema_version", "submap_index", "revision", "overlap_keyframe_ids", "base_keyframe_ids", "loop_keyframe_ids", "zero_motion_copies", "focal_hint", "ego_mask")
+    __slots__ = ("schema_version", "submap_index", "revision", "overlap_keyframe_ids", "base_keyframe_ids", "loop_keyframe_ids", "zero_motion_copies", "focal_hint", "ego_mask", "part")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     SUBMAP_INDEX_FIELD_NUMBER: _ClassVar[int]
     REVISION_FIELD_NUMBER: _ClassVar[int]
@@ -68,6 +77,7 @@ class SubmapSpec(_message.Message):
     ZERO_MOTION_COPIES_FIELD_NUMBER: _ClassVar[int]
     FOCAL_HINT_FIELD_NUMBER: _ClassVar[int]
     EGO_MASK_FIELD_NUMBER: _ClassVar[int]
+    PART_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     submap_index: int
     revision: int
@@ -77,7 +87,8 @@ class SubmapSpec(_message.Message):
     zero_motion_copies: _containers.RepeatedCompositeFieldContainer[ZeroMotionCopy]
     focal_hint: FocalHint
     ego_mask: _common_pb2.BlobRef
-    def __init__(self, schema_version: _Optional[int] = ..., submap_index: _Optional[int] = ..., revision: _Optional[int] = ..., overlap_keyframe_ids: _Optional[_Iterable[str]] = ..., base_keyframe_ids: _Optional[_Iterable[str]] = ..., loop_keyframe_ids: _Optional[_Iterable[str]] = ..., zero_motion_copies: _Optional[_Iterable[_Union[ZeroMotionCopy, _Mapping]]] = ..., focal_hint: _Optional[_Union[FocalHint, _Mapping]] = ..., ego_mask: _Optional[_Union[_common_pb2.BlobRef, _Mapping]] = ...) -> None: ...
+    part: SubmapPart
+    def __init__(self, schema_version: _Optional[int] = ..., submap_index: _Optional[int] = ..., revision: _Optional[int] = ..., overlap_keyframe_ids: _Optional[_Iterable[str]] = ..., base_keyframe_ids: _Optional[_Iterable[str]] = ..., loop_keyframe_ids: _Optional[_Iterable[str]] = ..., zero_motion_copies: _Optional[_Iterable[_Union[ZeroMotionCopy, _Mapping]]] = ..., focal_hint: _Optional[_Union[FocalHint, _Mapping]] = ..., ego_mask: _Optional[_Union[_common_pb2.BlobRef, _Mapping]] = ..., part: _Optional[_Union[SubmapPart, str]] = ...) -> None: ...
 
 class FrameGeometry(_message.Message):
     __slots__ = ("keyframe_id", "intrinsics", "submap_from_camera", "depth", "codec")
