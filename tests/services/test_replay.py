@@ -53,6 +53,7 @@ class Receiver(threading.Thread):
     def __init__(self, source: ZenohSource, pause_s: float = 0.0) -> None:
         super().__init__(daemon=True)
         self.source, self.pause_s = source, pause_s
+        source.join()
         self.frames: list[Frame] = []
         self.error: Exception | None = None
         self.start()
@@ -153,6 +154,7 @@ def test_a_start_behind_the_end_is_an_error(config: Config, recording: Path) -> 
 def test_frames_of_a_bridge_the_newest_win(config: Config) -> None:
     """A publisher without numbers is never held up; what a slow receiver cannot take is dropped and counted."""
     source = ZenohSource(config.bus, "front", Selection())
+    source.join()
     with open_bus(config.bus) as bus:
         publisher = bus.publisher(bus.keys.image("front"), blocking=True)
         frames = source.frames()
@@ -182,5 +184,7 @@ def test_no_camera_is_one_clear_error(config: Config) -> None:
 
 def test_no_router_is_one_clear_error() -> None:
     nowhere = bus_config(f"tcp/127.0.0.1:{free_port()}", connect_timeout_s=0.3)
+    source = ZenohSource(nowhere, "front", Selection())
     with pytest.raises(SourceError, match="zenoh:front: no router"):
-        ZenohSource(nowhere, "front", Selection())
+        next(source.frames())
+    source.close()

@@ -27,9 +27,11 @@ def test_an_image_comes_back_as_it_went(encoded: bytes, media_type: str, time_ns
     assert message.timestamp.seconds * 10**9 + message.timestamp.nanos == time_ns
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.booleans(), TIMES_NS)
-def test_the_header_travels_beside_the_image(index: int, epoch: int, is_last: bool, time_ns: int) -> None:
-    header = ImageHeader(epoch, index, is_last)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.booleans(), st.booleans(), TIMES_NS)
+def test_the_header_travels_beside_the_image(
+    index: int, epoch: int, is_last: bool, is_accepted: bool, time_ns: int
+) -> None:
+    header = ImageHeader(epoch, index, is_last, is_accepted)
     image = decode_image(encode_image(Frame(index, time_ns, b"x", "image/png"), "front"), header.encode())
     assert image.header == header
     assert decode_image(encode_image(Frame(index, time_ns, b"x", "image/png"), "front")).header is None

@@ -377,6 +377,25 @@ def test_frames_of_a_bridge_are_those_that_the_frontend_accepted(tmp_path: Path)
     frames = list(McapSource(path, Selection()).frames())
     assert [f.encoded for f in frames] == [image(index) for index in (0, 2, 3, 4, 5)]
     assert [f.index for f in frames] == [0, 1, 2, 3, 4]
+    with Recording.open(path, chunk_bytes=CHUNK_BYTES) as again:
+        f = frame(5)
+        assert not again.add_unnumbered_frame("front", f.encoded, f.media_type, f.capture_time_ns)
+        assert again.frame_count == 6
+
+
+def test_frames_of_a_bridge_without_times_are_all_taken(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    segment = segment_pb2.Segment(schema_version=1, index=0, camera="front")
+    for number in range(3):
+        segment.frames.add(frame_index=number, capture_time_ns=10**18 + number)  # the frontend's clock
+    entry = LogEntry("segment", 0, "segment/0", "vggt_motion.v1.Segment", segment.SerializeToString(), 0)
+    with Recording.open(path, chunk_bytes=CHUNK_BYTES) as recording:
+        for index in range(4):
+            assert recording.add_unnumbered_frame("front", image(index), frame(index).media_type, 0)
+        recording.add_entry(entry)
+    frames = list(McapSource(path, Selection()).frames())
+    assert [f.encoded for f in frames] == [image(index) for index in range(4)]
+    assert (np.diff([f.capture_time_ns for f in frames]) > 0).all()
 
 
 def test_an_unreadable_image_ends_the_input_there(tmp_path: Path) -> None:

@@ -25,11 +25,16 @@ class ImageHeader:
     epoch: int
     frame_index: int
     is_last: bool = False  # no frame follows
+    is_accepted: bool = True  # epoch and index are those of the frontend's records; False for a replay
 
     def encode(self) -> bytes:
         """The attachment of the image's message."""
         return recording_pb2.ImageHeader(
-            schema_version=_SCHEMA_VERSION, epoch=self.epoch, frame_index=self.frame_index, is_last=self.is_last
+            schema_version=_SCHEMA_VERSION,
+            epoch=self.epoch,
+            frame_index=self.frame_index,
+            is_last=self.is_last,
+            is_accepted=self.is_accepted,
         ).SerializeToString()
 
 
@@ -72,4 +77,4 @@ def _decode_header(attachment: bytes) -> ImageHeader:
     if message.frame_index >= 2**32:
         # MCAP numbers messages with 32 bits.
         raise CodecError(f"frame index {message.frame_index} is out of range")
-    return ImageHeader(message.epoch, message.frame_index, message.is_last)
+    return ImageHeader(message.epoch, message.frame_index, message.is_last, message.is_accepted)

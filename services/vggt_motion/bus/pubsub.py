@@ -148,7 +148,9 @@ class Subscription:
             except zenoh.ZError:
                 return  # undeclared, or the session was closed
             if self.is_closed:
-                return
+                # Taken to the end all the same: a full channel that nobody reads blocks a thread of Zenoh's for good,
+                # and with it the next session that this process opens.
+                continue
             if received.kind != zenoh.SampleKind.PUT:
                 continue
             try:

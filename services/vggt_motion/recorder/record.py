@@ -37,7 +37,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from vggt_motion import __version__
 from vggt_motion.errors import CodecError, InputError, SourceError, VggtMotionError
-from vggt_motion.foxglove import MAP_FRAME, MAP_FROM_WORLD, WORLD_FRAME, encode_image, frame_transform
+from vggt_motion.foxglove import MAP_FRAME, MAP_FROM_WORLD, WORLD_FRAME, decode_image, encode_image, frame_transform
 from vggt_motion.recorder import schemas
 from vggt_motion.recorder.container import MAGIC, McapScanner, StoredMessage
 from vggt_motion.recorder.indexset import IndexSet
@@ -371,6 +371,9 @@ class Recording:
                 if not self._frames.setdefault((camera, epoch), IndexSet()).add(message.sequence):
                     return
             else:
+                encoded, _, capture_time_ns = decode_image(message.data)
+                if not self._is_new_frame(camera, capture_time_ns, encoded):
+                    return
                 self._unnumbered_counts[camera] = self._unnumbered_counts.get(camera, 0) + 1
         elif channel.topic.startswith(LOG_TOPIC):
             stream = channel.topic.removeprefix(LOG_TOPIC)

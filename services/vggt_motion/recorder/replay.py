@@ -93,7 +93,7 @@ def replay(
                 publisher.put(
                     encode_image(frame, with_camera),
                     timestamp_ns=time.time_ns(),
-                    attachment=ImageHeader(0, frame.index, is_last).encode(),
+                    attachment=ImageHeader(0, frame.index, is_last, is_accepted=False).encode(),
                 )
                 count += 1
         finally:

@@ -150,7 +150,8 @@ class _Recorder:
         camera = sample.key.split("/")[-2]
         try:
             image = decode_image(sample.payload, sample.attachment)
-            if image.header is None:
+            if image.header is None or not image.header.is_accepted:
+                # Which of these the frontend takes, and under which number, its segments will say.
                 self._recording.add_unnumbered_frame(camera, image.encoded, image.media_type, image.capture_time_ns)
             else:
                 frame_id = FrameId(camera, image.header.epoch, image.header.frame_index)

@@ -25,8 +25,7 @@ class ViewWriter:
     def __init__(self, recording: Recording) -> None:
         """Views of a recording; what an earlier process wrote into it is not written again."""
         self._recording = recording
-        self._trajectory_size = 0
-        self._map_size = 0
+        self._written: dict[str, tuple[int, bool]] = {}  # topic -> keyframes, is final; by this process
 
     def add_trajectory(self, trajectory: Trajectory) -> None:
         """Write the poses of new keyframes and, when it has grown enough or is final, the whole trajectory.
@@ -37,17 +36,14 @@ class ViewWriter:
         posed = [frame for frame in trajectory.keyframes if frame.world_from_camera is not None]
         for frame in posed:
             self._add_pose(frame)
-        is_due = len(posed) >= _TRAJECTORY_GROWTH * self._trajectory_size and len(posed) > self._trajectory_size
-        if posed and (is_due or self._is_missing(trajectory, TRAJECTORY_TOPIC)):
-            self._trajectory_size = len(posed)
+        if posed and self._is_due(trajectory, TRAJECTORY_TOPIC, _TRAJECTORY_GROWTH):
+            self._note(trajectory, TRAJECTORY_TOPIC)
             for component in trajectory.components:
                 self._add_part(trajectory, component, [frame for frame in posed if frame.component == component])
 
     def wants_map(self, trajectory: Trajectory) -> bool:
         """Whether a map of this trajectory should be made and given to :meth:`add_map`."""
-        size = len(trajectory.keyframes)
-        is_due = size >= _MAP_GROWTH * self._map_size and size > self._map_size
-        return is_due or self._is_missing(trajectory, MAP_TOPIC)
+        return self._is_due(trajectory, MAP_TOPIC, _MAP_GROWTH)
 
     def add_map(self, points: PointMap, trajectory: Trajectory) -> None:
         """Write the map.
@@ -55,7 +51,7 @@ class ViewWriter:
         Raises:
             RecordingClosedError: the recording was closed meanwhile.
         """
-        self._map_size = len(trajectory.keyframes)
+        self._note(trajectory, MAP_TOPIC)
         if len(points.points) == 0:
             return
         component = main_component(trajectory)
@@ -63,8 +59,17 @@ class ViewWriter:
         message = foxglove.point_cloud(points.points, points.colors, foxglove.world_frame(component), time_ns)
         self._recording.add_map(trajectory.graph_revision, message, time_ns)
 
-    def _is_missing(self, trajectory: Trajectory, topic: str) -> bool:
-        return trajectory.is_final and self._recording.view_revision(topic) != trajectory.graph_revision
+    def _is_due(self, trajectory: Trajectory, topic: str, growth: float) -> bool:
+        written = self._written.get(topic)
+        if written is None:
+            return self._recording.view_revision(topic) != trajectory.graph_revision
+        size, was_final = written
+        if trajectory.is_final:
+            return not was_final
+        return len(trajectory.keyframes) > size and len(trajectory.keyframes) >= growth * size
+
+    def _note(self, trajectory: Trajectory, topic: str) -> None:
+        self._written[topic] = (len(trajectory.keyframes), trajectory.is_final)
 
     def _add_pose(self, frame: TrajectoryPose) -> None:
         frame_id = FrameId(frame.camera, frame.epoch, frame.frame_index)

@@ -180,8 +180,13 @@ def _in_order(entries: list[_Entry], path: Path) -> list[_Entry]:
 
 
 def _as_listed(entries: list[_Entry], accepted: dict[int, int]) -> list[_Entry]:
-    """Frames without numbers: what the segments list, and what came after the last; all where there are none."""
-    if not accepted:
+    """Frames without numbers: what the segments list, and what came after the last.
+
+    All of them where there are no segments, and where the frontend had to give other times than the frames' own (a
+    bridge that leaves the time unset), so that frames and segments cannot be brought together.
+    """
+    times = {entry.capture_time_ns for entry in entries}
+    if not accepted or 2 * len(times & accepted.keys()) < len(accepted):
         return entries
     last_ns = max(accepted)
     return [entry for entry in entries if entry.capture_time_ns in accepted or entry.capture_time_ns > last_ns]

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 from vggt_motion.bus.images import ReceivedImage, decode_image
 from vggt_motion.bus.keys import Keys
-from vggt_motion.bus.session import Sample, open_bus
+from vggt_motion.bus.session import Bus, Sample, open_bus
 from vggt_motion.config import BusConfig, Config, load_config
 from vggt_motion.errors import BusError, CodecError, SourceError
 from vggt_motion.sources.encoded import media_type_of
@@ -45,7 +45,7 @@ class ZenohSource:
         first_frame_timeout_s: float = 60.0,
         idle_timeout_s: float | None = None,
     ) -> None:
-        """Join the bus over a link of its own: a source that waits may hold up nothing else.
+        """Remember where; the bus is joined by :meth:`join`, at the latest by :meth:`frames`.
 
         Args:
             config: endpoint and session.
@@ -55,13 +55,12 @@ class ZenohSource:
             idle_timeout_s: the stream has ended when nothing came for so long; None = it never ends by itself.
 
         Raises:
-            SourceError: no router answers, or the camera's name cannot be part of a key.
+            ConfigurationError: the camera's name cannot be part of a key.
         """
-        try:
-            self._key = Keys(config.session).image(camera)
-            self._bus = open_bus(config)
-        except BusError as error:
-            raise SourceError(f"zenoh:{camera}: {error}") from error
+        self._config = config
+        self._camera = camera
+        self._key = Keys(config.session).image(camera)
+        self._bus: Bus | None = None
         self._selection = selection
         self._first_frame_timeout_s = first_frame_timeout_s
         self._idle_timeout_s = idle_timeout_s
@@ -74,14 +73,28 @@ class ZenohSource:
         self.refused_count = 0  # messages that are no image
         self.description = f"camera {camera} on the bus, session {config.session}"
         self.fingerprint = f"zenoh:{camera}:{selection}"
+
+    def join(self) -> None:
+        """Join the bus and begin to receive, over a link of its own: a source that waits may hold up nothing else.
+
+        Raises:
+            SourceError: no router answers.
+        """
+        if self._bus is not None:
+            return
+        try:
+            self._bus = open_bus(self._config)
+        except BusError as error:
+            raise SourceError(f"zenoh:{self._camera}: {error}") from error
         self._bus.subscribe(self._key, self._on_sample, history=True)
 
     def frames(self) -> Iterator[Frame]:
         """The frames in order of arrival, until the publisher says that it was the last, or :meth:`close`.
 
         Raises:
-            SourceError: not one frame arrived in time.
+            SourceError: no router answers, or not one frame arrived in time.
         """
+        self.join()
         repair: TimestampRepair | None = None
         position = index = 0
         while (image := self._next(is_first=position == 0)) is not None:
@@ -103,7 +116,8 @@ class ZenohSource:
     def close(self) -> None:
         """End the stream and leave the bus; safe to call twice."""
         self._end()
-        self._bus.close()
+        if self._bus is not None:
+            self._bus.close()
 
     def _end(self) -> None:
         with self._changed:

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from vggt_motion.v1 import common_pb2 as vggt__motion_dot_v1_dot_common__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1evggt_motion/v1/recording.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\"Z\n\x0bImageHeader\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\r\n\x05\x65poch\x18\x02 \x01(\x04\x12\x13\n\x0b\x66rame_index\x18\x03 \x01(\x04\x12\x0f\n\x07is_last\x18\x04 \x01(\x08\"R\n\x04\x42lob\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12$\n\x03ref\x18\x02 \x01(\x0b\x32\x17.vggt_motion.v1.BlobRef\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1evggt_motion/v1/recording.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\"o\n\x0bImageHeader\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\r\n\x05\x65poch\x18\x02 \x01(\x04\x12\x13\n\x0b\x66rame_index\x18\x03 \x01(\x04\x12\x0f\n\x07is_last\x18\x04 \x01(\x08\x12\x13\n\x0bis_accepted\x18\x05 \x01(\x08\"R\n\x04\x42lob\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12$\n\x03ref\x18\x02 \x01(\x0b\x32\x17.vggt_motion.v1.BlobRef\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'vggt_motion.v1.recording_pb
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_IMAGEHEADER']._serialized_start=79
-  _globals['_IMAGEHEADER']._serialized_end=169
-  _globals['_BLOB']._serialized_start=171
-  _globals['_BLOB']._serialized_end=253
+  _globals['_IMAGEHEADER']._serialized_end=190
+  _globals['_BLOB']._serialized_start=192
+  _globals['_BLOB']._serialized_end=274
 # @@protoc_insertion_point(module_scope)

@@ -6,16 +6,18 @@ from typing import ClassVar as _ClassVar, Mapping as _Mapping, Optional as _Opti
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class ImageHeader(_message.Message):
-    __slots__ = ("schema_version", "epoch", "frame_index", "is_last")
+    __slots__ = ("schema_version", "epoch", "frame_index", "is_last", "is_accepted")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     FRAME_INDEX_FIELD_NUMBER: _ClassVar[int]
     IS_LAST_FIELD_NUMBER: _ClassVar[int]
+    IS_ACCEPTED_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     epoch: int
     frame_index: int
     is_last: bool
-    def __init__(self, schema_version: _Optional[int] = ..., epoch: _Optional[int] = ..., frame_index: _Optional[int] = ..., is_last: bool = ...) -> None: ...
+    is_accepted: bool
+    def __init__(self, schema_version: _Optional[int] = ..., epoch: _Optional[int] = ..., frame_index: _Optional[int] = ..., is_last: bool = ..., is_accepted: bool = ...) -> None: ...
 
 class Blob(_message.Message):
     __slots__ = ("schema_version", "ref", "data")
