@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vggt_motion.errors import SourceError
+from vggt_motion.sources.camera import is_device, is_stream
 from vggt_motion.sources.image_folder import ImageFolder, times_beside
 from vggt_motion.sources.kitti import KittiFolder, camera_folder
 from vggt_motion.sources.selection import DEFAULT_NOMINAL_RATE_HZ, Selection
@@ -34,6 +35,8 @@ def is_on_bus(location: str) -> bool:
 
 SOURCE_KINDS: tuple[SourceKind, ...] = (
     SourceKind("zenoh", is_on_bus, "vggt_motion.sources.zenoh:open_zenoh"),
+    SourceKind("stream", is_stream, "vggt_motion.sources.camera:open_stream"),
+    SourceKind("camera", is_device, "vggt_motion.sources.camera:open_device"),
     SourceKind("mcap", lambda location: location.lower().endswith(".mcap"), "vggt_motion.sources.mcap:open_mcap"),
     SourceKind("folder", lambda location: Path(location).is_dir(), "vggt_motion.sources.registry:open_folder"),
     SourceKind("video", lambda _: True, "vggt_motion.sources.registry:open_video"),
@@ -51,7 +54,8 @@ def open_source(
     """Open whatever the location names.
 
     Args:
-        location: image folder, KITTI sequence folder, video file, ``.mcap`` recording, or ``zenoh:CAMERA``.
+        location: image folder, KITTI sequence folder, video file, ``.mcap`` recording, ``zenoh:CAMERA``, the URL of a
+            stream (``rtsp://...``), or a camera at this machine (``camera:0``).
         start: first frame taken.
         end: first frame not taken any more; None = all.
         stride: every so many frames.

@@ -52,12 +52,20 @@ class CountsLosses(Protocol):
     refused_count: int  # messages or pictures that are no readable frame
 
 
+@runtime_checkable
+class CountsReconnects(Protocol):
+    """A live source that opens its device again when that stalls."""
+
+    reconnect_count: int
+
+
 def losses_of(source: Source) -> dict[str, float]:
     """What a source has lost so far, as counters for the status; empty for a source that loses nothing."""
-    if not isinstance(source, CountsLosses):
-        return {}
-    return {
-        "dropped_frames": source.dropped_count,
-        "missing_frames": source.missing_count,
-        "refused_frames": source.refused_count,
-    }
+    losses: dict[str, float] = {}
+    if isinstance(source, CountsLosses):
+        losses["dropped_frames"] = source.dropped_count
+        losses["missing_frames"] = source.missing_count
+        losses["refused_frames"] = source.refused_count
+    if isinstance(source, CountsReconnects):
+        losses["reconnects"] = source.reconnect_count
+    return losses

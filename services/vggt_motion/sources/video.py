@@ -9,17 +9,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from vggt_motion.errors import SourceError, SourceTruncatedError
 from vggt_motion.sources.encoded import JPEG, encode_video_frame
 from vggt_motion.sources.selection import Selection
 from vggt_motion.sources.source import Frame
 from vggt_motion.sources.timing import NANOSECONDS, TimestampRepair
-
-# FFmpeg reports each damaged macro-block on stderr; we say it once, in our words. Read by OpenCV at the first capture.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-
-import cv2
-import numpy as np
 
 _log = logging.getLogger(__name__)
 
@@ -123,9 +120,18 @@ class VideoFile:
             )
 
 
+def quiet_ffmpeg() -> None:
+    """Keep FFmpeg from reporting each damaged macro-block on stderr: we say it once, in our words.
+
+    OpenCV reads the variable at its first capture; what a user has set stays.
+    """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
 def _open(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
         raise SourceError(f"no such file: {path}")
+    quiet_ffmpeg()
     # Hardware decoders differ between machines; software decoding of a file is bit-exact by the standard.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE])
     if not capture.isOpened():
