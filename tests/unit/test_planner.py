@@ -194,6 +194,23 @@ def edges(state: LogState) -> set[tuple[int, int]]:
     return {(c.spec.i, c.spec.j) for c in planner.current_constraints(state)}
 
 
+def test_submaps_of_a_straight_road_agree_on_one_focal_length_though_nobody_knows_it() -> None:
+    state = started(5)
+    run(state, random.Random(0), {0: 0.69, 1: 0.41, 2: 0.57, 3: 0.6, 4: 0.5}, sigma=0.2)
+    assert planner.is_complete(state, CONFIG)
+    second = {
+        geometry.spec.submap_index: geometry.spec.focal_hint for (_, r), geometry in state.submaps.items() if r == 2
+    }
+    hints = set(second.values())
+    assert len(hints) == 1
+    hint = hints.pop()
+    assert hint is not None and hint.relative_sigma <= 0.005
+    for geometry in state.usable_submaps().values():
+        assert geometry.quality.focal_over_width == pytest.approx(
+            hint.focal_over_width, rel=planner.MAX_FOCAL_DEVIATION
+        )
+
+
 def test_a_dead_submap_is_predicted_in_two_overlapping_halves() -> None:
     state = started(5, base=7)
     state.apply(dead(whole(2)))
