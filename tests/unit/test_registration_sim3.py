@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from vggt_motion.config import RegistrationConfig
 from vggt_motion.errors import RegistrationError
 from vggt_motion.geometry import se3, sim3, umeyama
+from vggt_motion.geometry.projection import Intrinsics, pixel_rays, unproject
 from vggt_motion.geometry.sim3 import Sim3
-from vggt_motion.registration import kernels
+from vggt_motion.registration import anchors, kernels
 from vggt_motion.registration.sim3 import estimate_sim3
 
 CONFIG = RegistrationConfig()
@@ -73,8 +74,8 @@ def test_equivariance(seed: int, other: int) -> None:
     plain = estimate_sim3(x, y, weights, depth, start, CONFIG)
     moved_target = estimate_sim3(x, move.act(y), weights, move.scale * depth, move @ start, CONFIG)
     moved_source = estimate_sim3(move.act(x), y, weights, depth, start @ move.inverse(), CONFIG)
-    assert max(error(moved_target.j_from_i, move @ plain.j_from_i)) < 2e-5
-    assert max(error(moved_source.j_from_i, plain.j_from_i @ move.inverse())) < 2e-5
+    assert max(error(moved_target.j_from_i, move @ plain.j_from_i)) < 1e-4
+    assert max(error(moved_source.j_from_i, plain.j_from_i @ move.inverse())) < 1e-4
     assert moved_target.inlier_ratio == pytest.approx(plain.inlier_ratio, abs=2e-3)
     # the information belongs to the left perturbation in frame j and is carried along by the adjoint
     adjoint = move.adjoint()
@@ -89,7 +90,7 @@ def test_order_of_points_does_not_matter(seed: int) -> None:
     order = np.random.default_rng(seed).permutation(len(x))
     a = estimate_sim3(x, y, np.ones(len(x)), depth, start, CONFIG)
     b = estimate_sim3(x[order], y[order], np.ones(len(x)), depth[order], start, CONFIG)
-    assert max(error(a.j_from_i, b.j_from_i)) < 1e-6
+    assert max(error(a.j_from_i, b.j_from_i)) < 1e-5
 
 
 def test_same_input_same_bits() -> None:
@@ -122,7 +123,7 @@ def test_estimate_is_a_fixed_point_of_the_numpy_reference(seed: int) -> None:
     _, x, y, depth, start, _ = scene(seed)
     got = estimate_sim3(x, y, np.ones(len(x)), depth, start, CONFIG)
     residual, weights = reference_weights(x, y, depth, got.j_from_i)
-    assert max(error(umeyama.align(x, y, weights, "symmetric"), got.j_from_i)) < 1e-5
+    assert max(error(umeyama.align(x, y, weights, "symmetric"), got.j_from_i)) < 5e-5
     assert got.median_relative_residual == pytest.approx(np.median(residual), rel=1e-4)
     assert got.inlier_ratio == pytest.approx(np.mean(residual <= CONFIG.inlier_relative), abs=2e-3)
 
@@ -130,25 +131,70 @@ def test_estimate_is_a_fixed_point_of_the_numpy_reference(seed: int) -> None:
 def test_kernels_against_numpy() -> None:
     _, x, y, depth, start, _ = scene(11)
     x32, y32, unit = x.astype(np.float32), y.astype(np.float32), (1 / depth).astype(np.float32)
+    columns_x, columns_y = np.ascontiguousarray(x32.T), np.ascontiguousarray(y32.T)
     base = np.random.default_rng(0).uniform(0.5, 1.5, len(x)).astype(np.float32)
     affine = np.ascontiguousarray(start.matrix()[:3])
     ox, oy = x.mean(axis=0), y.mean(axis=0)
-    cutoff = 0.5
     residual = np.linalg.norm(start.act(x32.astype(float)) - y32, axis=1) * unit
-    w = base * unit.astype(float) ** 2 * np.minimum(1.0, 0.02 / residual) * (residual < cutoff)
+    w = base * unit.astype(float) ** 2 * np.minimum(1.0, 0.02 / residual)
     dx, dy = x32 - ox, y32 - oy
     expected = np.concatenate(
         [[w.sum()], w @ dx, w @ dy, ((dy * w[:, None]).T @ dx).ravel(), [w @ (dx**2).sum(1)], [w @ (dy**2).sum(1)]]
     )
-    got = kernels.accumulate(x32, y32, base, unit, affine, 0.02, cutoff, ox, oy)
+    got = kernels.accumulate(columns_x, columns_y, base, unit, affine, 0.02, ox, oy, 1)
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-7 * np.abs(expected).max())
     centre = start.act(ox)
     p = start.act(x32.astype(float)) - centre
     second = (p * w[:, None]).T @ p
-    residuals, sums = kernels.score(x32, y32, base, unit, affine, 0.02, cutoff, centre)
+    residuals, sums = kernels.score(columns_x, columns_y, base, unit, affine, 0.02, centre)
     np.testing.assert_allclose(residuals, residual, rtol=1e-5)
     expected = np.concatenate([[w.sum()], w @ p, second[np.triu_indices(3)]])
     np.testing.assert_allclose(sums, expected, rtol=1e-5, atol=1e-7 * np.abs(second).max())
+
+
+def test_gather_keeps_the_usable_points_in_order() -> None:
+    _, x, y, depth, _, _ = scene(4, count=50)
+    weights = np.ones(50)
+    x[3, 1], y[7, 0], depth[11], depth[12], weights[20] = np.nan, np.inf, 0.0, -1.0, 0.0
+    keep = np.setdiff1d(np.arange(50), [3, 7, 11, 12, 20])
+    for dtype in (np.float32, np.float64):
+        arrays = [array.astype(dtype) for array in (x, y, weights, depth)]
+        got_x, got_y, got_w, got_unit = kernels.gather(*arrays)
+        np.testing.assert_array_equal(got_x, x[keep].astype(np.float32).T)
+        np.testing.assert_array_equal(got_y, y[keep].astype(np.float32).T)
+        np.testing.assert_allclose(got_unit, 1 / depth[keep], rtol=1e-6)
+        assert len(got_w) == len(keep)
+
+
+def test_a_coarse_pass_sums_over_some_blocks_only() -> None:
+    _, x, y, depth, start, _ = scene(11, count=3000)
+    arguments = [*kernels.gather(x, y, np.ones(len(x)), depth), np.ascontiguousarray(start.matrix()[:3]), 0.02]
+    origin = np.zeros(3)
+    parts = []
+    for first in range(5):
+        shifted = np.concatenate([np.arange(128 * b, min(128 * b + 128, 3000)) for b in range(first, 24, 5)])
+        own = kernels.gather(x[shifted], y[shifted], np.ones(len(shifted)), depth[shifted])
+        parts.append(kernels.accumulate(*own, *arguments[4:], origin, origin, 1))
+    np.testing.assert_allclose(kernels.accumulate(*arguments, origin, origin, 5), parts[0], rtol=1e-12)
+    np.testing.assert_allclose(kernels.accumulate(*arguments, origin, origin, 1), np.sum(parts, axis=0), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("k1_i", "k1_j"), [(0.0, 0.0), (-0.2, 0.05)])
+def test_unprojection_of_a_pair_against_numpy(k1_i: float, k1_j: float) -> None:
+    rng = np.random.default_rng(0)
+    camera_i, camera_j = Intrinsics.centred(60.0, 64, 32, k1_i), Intrinsics.centred(63.0, 64, 32, k1_j)
+    pose_i, pose_j = se3.exp(rng.normal(0, 1, 6)), se3.exp(rng.normal(0, 1, 6))
+    depth_i, depth_j = (rng.uniform(2, 50, (32, 64)).astype(np.float32) for _ in range(2))
+    mask = rng.random((32, 64)) < 0.7
+    x, y, inverse, rays = kernels.unproject_pair(
+        depth_i, depth_j, mask, anchors._camera(camera_i), anchors._camera(camera_j), pose_i, pose_j, 1.7
+    )
+    np.testing.assert_allclose(x.T, se3.act(pose_i, unproject(depth_i, camera_i)[mask]), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(y.T, se3.act(pose_j, unproject(depth_j, camera_j)[mask]), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(inverse, 1 / np.sqrt(1.7 * depth_i[mask].astype(float) * depth_j[mask]), rtol=1e-6)
+    r = pixel_rays(camera_j)[mask]
+    expected = [r[:, 0].sum(), r[:, 1].sum(), *(r[:, a] @ r[:, b] for a, b in ((0, 0), (0, 1), (1, 1)))]
+    np.testing.assert_allclose(rays, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_information_is_the_curvature_of_the_cost() -> None:

@@ -16,17 +16,13 @@ import numpy.typing as npt
 from vggt_motion.config import RegistrationConfig
 from vggt_motion.errors import RegistrationError
 from vggt_motion.geometry import se3
-from vggt_motion.geometry.projection import Intrinsics, pixel_rays
+from vggt_motion.geometry.projection import Intrinsics
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.records import Constraint, ConstraintKind, RegistrationAttempt, RegistrationSpec
 from vggt_motion.registration.cameras import align as align_cameras
 from vggt_motion.registration.cameras import fuse, mean_rotation, witnesses
-from vggt_motion.registration.sim3 import (
-    estimate_sim3,
-    require_determined,
-    residual_statistics,
-    with_floor,
-)
+from vggt_motion.registration.sim3 import PointPairs, estimate_from_pairs, residual_statistics
+from vggt_motion.registration.uncertainty import require_determined, with_floor
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +34,7 @@ _MIN_BASELINE_FRAMES = 3
 _MIN_RAY_SPREAD = 0.01
 # Width of the middle 80 % of log-depth; below it the depth map is a constant, as of a predictor that saw nothing.
 _MIN_LOG_DEPTH_SPREAD = 0.02
+_STATISTIC_PIXELS = 16_384  # enough for the quantiles behind a refusal, and for the start
 # Points and cameras of the same submaps that differ by more contradict each other, as in a mirrored submap.
 _MAX_DISAGREEMENT_RAD = 0.2
 # Beyond these standard deviations (radians, typical depths, logarithm of scale) a part of the transform is guessed.
@@ -173,34 +170,21 @@ def _by_points(
     """Align by the point maps of the anchor, with all shared cameras as witnesses."""
     # 1. pixels that both sides trust
     masks = [_valid_pixels(frame, config) for frame in frames]
-    if sum(int(mask.sum()) for mask in masks) < config.min_points:
-        raise RegistrationError(f"{sum(int(m.sum()) for m in masks)} valid pixels, {config.min_points} are needed")
     depth_i = np.concatenate([frame.in_i.depth[mask] for frame, mask in zip(frames, masks, strict=True)])
     depth_j = np.concatenate([frame.in_j.depth[mask] for frame, mask in zip(frames, masks, strict=True)])
-    rays = [(_rays(frame.in_i, mask), _rays(frame.in_j, mask)) for frame, mask in zip(frames, masks, strict=True)]
-    _check_view(depth_i, depth_j, np.concatenate([rays_j for _, rays_j in rays]), shared)
+    if len(depth_i) < config.min_points:
+        raise RegistrationError(f"{len(depth_i)} valid pixels, at least {config.min_points} are needed")
+    thinned = slice(None, None, max(1, len(depth_i) // _STATISTIC_PIXELS))
+    depth_i, depth_j = depth_i[thinned], depth_j[thinned]
+    _check_depths(depth_i, depth_j, shared)
     # 2. a robust start: rotation of the shared cameras, median depth ratio
     scale = 1.0 if fix_scale else float(np.median(depth_j / depth_i))
     in_i, in_j = ([getattr(f, side).submap_from_camera for f in shared] for side in ("in_i", "in_j"))
     rotation = mean_rotation(np.array(in_i), np.array(in_j))
     start = _start(frames, rotation, scale)
     # 3. the same pixel is the same point
-    points_i, points_j = (
-        np.concatenate(
-            [
-                se3.act(view.submap_from_camera, view_rays[side] * view.depth[mask].astype(np.float64)[:, None])
-                for view, view_rays, mask in zip(views, rays, masks, strict=True)
-            ]
-        )
-        for side, views in enumerate(([f.in_i for f in frames], [f.in_j for f in frames]))
-    )
-    # Both depths err; dividing by one of them would favour the points that this side happens to see too near, and pull
-    # the scale by the variance of the noise, at every edge in the same direction.
-    depth = np.sqrt(scale * depth_i.astype(np.float64) * depth_j)
-    weights = np.ones(len(depth), dtype=np.float32)
-    estimate = estimate_sim3(
-        points_i, points_j, weights, depth, start, config, fix_scale=fix_scale, frame_count=len(frames)
-    )
+    pairs = _point_pairs(frames, masks, scale)
+    estimate = estimate_from_pairs(pairs, start, config, fix_scale=fix_scale)
     # 4. the cameras are witnesses too
     turned = float(np.linalg.norm(se3.so3_log(estimate.j_from_i.rotation @ rotation.T)))
     if turned > _MAX_DISAGREEMENT_RAD:
@@ -208,7 +192,7 @@ def _by_points(
     cameras = witnesses(in_i, in_j, estimate.typical_depth)
     fused, information = fuse(estimate.j_from_i, estimate.information, cameras, fix_scale=fix_scale)
     require_determined(information, estimate.centre, estimate.typical_depth, _MAX_SIGMA, fix_scale=fix_scale)
-    inlier_ratio, median = residual_statistics(points_i, points_j, depth, fused, config)
+    inlier_ratio, median = residual_statistics(pairs, fused, config)
     information = with_floor(information, estimate.centre, estimate.typical_depth, _SUBMAP_SIGMA, fix_scale=fix_scale)
     return _Found(fused, information, inlier_ratio, median, estimate.point_count)
 
@@ -254,22 +238,14 @@ def _threshold(confidence: npt.NDArray[np.float32], config: RegistrationConfig) 
             return config.confidence_value
 
 
-def _rays(view: AnchorView, mask: npt.NDArray[np.bool_]) -> Array:
-    return pixel_rays(view.intrinsics)[mask]
-
-
-def _check_view(
-    depth_i: npt.NDArray[np.float32], depth_j: npt.NDArray[np.float32], rays: Array, shared: Sequence[SharedFrame]
+def _check_depths(
+    depth_i: npt.NDArray[np.float32], depth_j: npt.NDArray[np.float32], shared: Sequence[SharedFrame]
 ) -> None:
-    """Refuse what gives a consistent but worthless transform.
+    """Refuse depths that give a consistent but worthless transform.
 
     Raises:
-        RegistrationError: the pixels lie along a line in the image, all depths are one, or all points are so far away
-            that their depth is not seen.
+        RegistrationError: all depths are one, or all points are so far away that their depth is not seen.
     """
-    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(rays[:, :2].T))[0].clip(0.0)))
-    if spread < _MIN_RAY_SPREAD:
-        raise RegistrationError("the valid pixels lie along a line in the image")
     for depth in (depth_i, depth_j):
         low, high = np.quantile(depth, [0.1, 0.9])
         if float(np.log(high / low)) < _MIN_LOG_DEPTH_SPREAD:
@@ -282,6 +258,50 @@ def _check_view(
                 raise RegistrationError(
                     "all points are far: the cameras of the overlap hardly move against their depth"
                 )
+
+
+def _point_pairs(frames: Sequence[SharedFrame], masks: Sequence[npt.NDArray[np.bool_]], scale: float) -> PointPairs:
+    """The masked pixels of the anchor as corresponding points.
+
+    The residual of a pixel is measured in the geometric mean of both depths. Both err: dividing by one of them would
+    favour the points that this side happens to see too near, and pull the scale of every edge in the same direction.
+
+    Raises:
+        RegistrationError: the pixels lie along a line in the image, so that a plane seen edge-on is all there is.
+    """
+    from vggt_motion.registration import kernels  # importing numba takes longer than registering a pair
+
+    parts, rays = [], np.zeros(5)
+    for frame, mask in zip(frames, masks, strict=True):
+        x, y, inverse_depth, sums = kernels.unproject_pair(
+            np.ascontiguousarray(frame.in_i.depth, dtype=np.float32),
+            np.ascontiguousarray(frame.in_j.depth, dtype=np.float32),
+            mask,
+            _camera(frame.in_i.intrinsics),
+            _camera(frame.in_j.intrinsics),
+            np.ascontiguousarray(frame.in_i.submap_from_camera, dtype=np.float64),
+            np.ascontiguousarray(frame.in_j.submap_from_camera, dtype=np.float64),
+            scale,
+        )
+        parts.append((x, y, inverse_depth))
+        rays += sums
+    count = sum(len(part[2]) for part in parts)
+    mean = rays[:2] / count
+    scatter = np.array([[rays[2], rays[3]], [rays[3], rays[4]]]) / count - np.outer(mean, mean)
+    if float(np.linalg.eigvalsh(scatter)[0]) < _MIN_RAY_SPREAD**2:
+        raise RegistrationError("the valid pixels lie along a line in the image")
+    if len(parts) == 1:
+        x, y, inverse_depth = parts[0]
+    else:
+        x, y = (np.concatenate([part[side] for part in parts], axis=1) for side in (0, 1))
+        inverse_depth = np.concatenate([part[2] for part in parts])
+    return PointPairs(x, y, np.ones(count, np.float32), inverse_depth, len(frames))
+
+
+def _camera(intrinsics: Intrinsics) -> Array:
+    """Focal lengths, principal point, k1, and the radius at which a barrel distortion folds back."""
+    fold = 1.0 / np.sqrt(-3.0 * intrinsics.k1) if intrinsics.k1 < 0.0 else np.inf
+    return np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1, fold])
 
 
 def _start(frames: Sequence[SharedFrame], rotation: Array, scale: float) -> Sim3:

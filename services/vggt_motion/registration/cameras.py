@@ -21,7 +21,8 @@ from vggt_motion.geometry.sim3 import Sim3
 
 Array = npt.NDArray[np.float64]
 
-_FUSE_ITERATIONS = 4
+_MAX_FUSE_ITERATIONS = 10
+_NEGLIGIBLE_DECREASE = 1e-8
 # Standard deviations of a single camera within its submap: what too few cameras cannot tell, and the best that is
 # believed.
 _SIGMA_ROTATION_RAD = 0.005
@@ -66,7 +67,7 @@ def witnesses(
     spread_i, spread_j = (float(np.sqrt((centres**2).sum())) for centres in (from_mean_i, from_mean_j))
     if count < _MIN_SCATTER_CAMERAS or spread_i == 0.0 or spread_j == 0.0:
         return CameraWitnesses(in_i, in_j, _SIGMA_ROTATION_RAD, _SIGMA_CENTRE_OVER_DEPTH * typical_depth_j)
-    turns = np.array([se3.so3_log(rotation @ a[:3, :3] @ b[:3, :3].T) for a, b in zip(in_i, in_j, strict=True)])
+    turns = _rotation_errors(rotation, in_i, in_j)
     offsets = (spread_j / spread_i) * from_mean_i @ rotation.T - from_mean_j
     baseline = float(np.linalg.norm(from_mean_j, axis=1).max())
     return CameraWitnesses(
@@ -121,24 +122,37 @@ def fuse(j_from_i: Sim3, information: Array, cameras: CameraWitnesses, *, fix_sc
     """
     size = 6 if fix_scale else 7
     current = j_from_i
-    weights = np.array([cameras.sigma_rotation_rad**-2] * 3 + [cameras.sigma_centre**-2] * 3)
+    centres_i, centres_j = cameras.i_from_camera[:, :3, 3], cameras.j_from_camera[:, :3, 3]
+    jacobian = np.zeros((len(centres_i), 6, 7))
+    jacobian[:, :3, :3] = np.eye(3)
+    jacobian[:, 3:, 3:6] = np.eye(3)
+    weight = np.array([cameras.sigma_rotation_rad**-2] * 3 + [cameras.sigma_centre**-2] * 3)
     total = information
-    for _ in range(_FUSE_ITERATIONS):
-        total = information.copy()
+    for _ in range(_MAX_FUSE_ITERATIONS):
+        centres = current.act(centres_i)
+        jacobian[:, 3:, :3] = np.cross(centres[:, None, :], np.eye(3))  # -skew(centre)
+        jacobian[:, 3:, 6] = centres
+        turns = _rotation_errors(current.rotation, cameras.i_from_camera, cameras.j_from_camera)
+        errors = np.concatenate([turns, centres - centres_j], axis=1)
+        total = information + np.einsum("kia,i,kib->ab", jacobian, weight, jacobian)
         gradient = information @ sim3.log(current @ j_from_i.inverse())
-        for in_i, in_j in zip(cameras.i_from_camera, cameras.j_from_camera, strict=True):
-            centre = current.act(in_i[:3, 3])
-            error = np.concatenate(
-                [se3.so3_log(current.rotation @ in_i[:3, :3] @ in_j[:3, :3].T), centre - in_j[:3, 3]]
-            )
-            jacobian = np.zeros((6, 7))
-            jacobian[:3, :3] = np.eye(3)
-            jacobian[3:, :3] = -se3.skew(centre)
-            jacobian[3:, 3:6] = np.eye(3)
-            jacobian[3:, 6] = centre
-            total += (jacobian.T * weights) @ jacobian
-            gradient += (jacobian.T * weights) @ error
+        gradient += np.einsum("kia,i,ki->a", jacobian, weight, errors)
         step = np.zeros(7)
         step[:size] = -np.linalg.solve(total[:size, :size], gradient[:size])
         current = sim3.exp(step) @ current
+        # the expected decrease of the cost: below it no step is worth a fraction of a standard deviation
+        if float(-gradient @ step) < _NEGLIGIBLE_DECREASE:
+            break
     return current, total
+
+
+def _rotation_errors(rotation: Array, i_from_camera: Array, j_from_camera: Array) -> Array:
+    """Rotation vectors (K, 3), in frame j, from where j has each camera to where ``rotation`` puts it from i."""
+    errors = rotation @ i_from_camera[:, :3, :3] @ j_from_camera[:, :3, :3].transpose(0, 2, 1)
+    axis = 0.5 * np.stack(
+        [errors[:, 2, 1] - errors[:, 1, 2], errors[:, 0, 2] - errors[:, 2, 0], errors[:, 1, 0] - errors[:, 0, 1]],
+        axis=1,
+    )
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(errors, axis1=1, axis2=2) - 1.0))
+    return np.asarray(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None], dtype=np.float64)

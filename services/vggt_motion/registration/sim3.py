@@ -16,24 +16,37 @@ from vggt_motion.config import RegistrationConfig
 from vggt_motion.errors import RegistrationError
 from vggt_motion.geometry import se3, umeyama
 from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.registration.uncertainty import about, require_determined
 
 Array = npt.NDArray[np.float64]
 
-_CONVERGED = 1e-7
-# The norm of a 3-vector of unit normal components has this median (square root of the chi-squared median with 3
-# degrees).
+_CONVERGED = 1e-5  # radians, typical depths, logarithm of scale: a hundredth of what an edge is worth
+# A part of the points finds the weights nearly as well as all of them, which then need few passes.
+_COARSE_STRIDE, _COARSE_CONVERGED, _COARSE_MIN_POINTS = 5, 1e-3, 10_000
+_MEDIAN_POINTS = 16_384  # know the median to one part in a hundred of the spread
+# The norm of a vector of three unit normal components has this median: the root of that of chi-squared.
 _MEDIAN_OF_NORM = 1.5382
 # Float16 depth on the wire is worth 5e-4; no estimate may claim to be better than about that.
 _SIGMA_FLOOR = 5e-4
 # Neighbouring pixels err together: an anchor image is worth about this many independent points. Measured on KITTI,
 # where points against cameras weigh best so (see cameras.py).
 _INDEPENDENT_POINTS_PER_FRAME = 500.0
-# Beyond these standard deviations (radians, typical depths, logarithm of scale) the points do not determine a
-# transform.
-MAX_SIGMA = np.array([0.05] * 3 + [0.1] * 3 + [0.1])
-# Below this ratio of the extreme eigenvalues of the normal equations, all parts in one unit, something is not seen at
-# all.
-_SINGULAR = 1e-9
+# Beyond these standard deviations (radians, typical depths, logarithm of scale) the points determine no transform.
+_MAX_SIGMA = np.array([0.05] * 3 + [0.1] * 3 + [0.1])
+
+
+@dataclass(frozen=True)
+class PointPairs:
+    """Corresponding points of both submaps, all usable, by coordinate."""
+
+    in_i: npt.NDArray[np.float32]  # (3, N)
+    in_j: npt.NDArray[np.float32]  # (3, N)
+    weight: npt.NDArray[np.float32]  # (N,), positive
+    inverse_depth: npt.NDArray[np.float32]  # (N,), units of j; the unit of the residuals
+    frame_count: int  # images they come from
+
+    def __len__(self) -> int:
+        return len(self.weight)
 
 
 @dataclass(frozen=True)
@@ -45,9 +58,9 @@ class Sim3Estimate:
     median_relative_residual: float
     information: Array  # (7, 7): rotation, translation, log-scale; left perturbation exp(xi) @ j_from_i, frame j
     centre: Array  # (3,) middle of the points, frame j
-    typical_depth: float  # median depth, units of frame j
+    typical_depth: float  # harmonic mean depth, units of frame j
     point_count: int  # valid points
-    iterations: int
+    iterations: int  # passes over all points
 
 
 def estimate_sim3(
@@ -69,9 +82,9 @@ def estimate_sim3(
         weights: (N,), not negative.
         depth_j: (N,) depth of each pixel along the optical axis, units of frame j; the unit of its residual.
         start: where the weights start; it must be robust itself, or the first fit is lost to outliers.
-        config: Huber width, inlier radius, iterations, fewest points.
-        fix_scale: both sides are metric: keep the scale 1 (SE(3)); the information of the log-scale is then that of a
-            constraint that holds it.
+        config: loss, scale rule, inlier radius, iterations, fewest points.
+        fix_scale: both sides are metric: keep the scale 1 (SE(3)); only the first six rows of the information count
+            then.
         frame_count: images that the points come from; neighbouring pixels err together, so that it is images and not
             pixels that make an estimate more certain.
 
@@ -80,81 +93,73 @@ def estimate_sim3(
     """
     from vggt_motion.registration import kernels  # importing numba takes longer than registering a pair
 
-    x, y, w, unit = _valid(points_i, points_j, weights, depth_j, config)
+    count = len(points_i)
+    if not (points_i.shape == points_j.shape == (count, 3) and weights.shape == depth_j.shape == (count,)):
+        raise ValueError(f"shapes: {points_i.shape}, {points_j.shape}, {weights.shape}, {depth_j.shape}")
+    pairs = PointPairs(*kernels.gather(points_i, points_j, weights, depth_j), frame_count)
+    return estimate_from_pairs(pairs, start, config, fix_scale=fix_scale)
+
+
+def estimate_from_pairs(
+    pairs: PointPairs, start: Sim3, config: RegistrationConfig, *, fix_scale: bool = False
+) -> Sim3Estimate:
+    """:func:`estimate_sim3` for points that are prepared already."""
+    from vggt_motion.registration import kernels
+
+    if len(pairs) < max(config.min_points, 3):
+        raise RegistrationError(f"{len(pairs)} valid points, at least {config.min_points} are needed")
+    x, y, w, unit = pairs.in_i, pairs.in_j, pairs.weight, pairs.inverse_depth
+    origin_x, origin_y = (points.mean(axis=1, dtype=np.float64) for points in (x, y))
+    typical = float(1.0 / unit.mean(dtype=np.float64))
     is_relative = config.residual == "depth_relative"
-    ones = np.ones_like(unit)
-    loss_unit = unit if is_relative else ones
+    loss_unit = unit if is_relative else np.ones_like(unit)
     huber = config.huber_relative if is_relative else config.huber_absolute
     rule: umeyama.ScaleRule = "fixed" if fix_scale else config.scale_rule
     current = Sim3(start.rotation, start.translation, 1.0) if fix_scale else start
-    origin_x = x.mean(axis=0, dtype=np.float64)
-    origin_y = y.mean(axis=0, dtype=np.float64)
-    typical = float(1.0 / np.median(unit))
-    iterations, step = 0, np.inf
-    while step >= _CONVERGED and iterations < config.max_iterations:
-        sums = kernels.accumulate(x, y, w, loss_unit, _affine(current), huber, np.inf, origin_x, origin_y)
-        following = umeyama.solve(_moments(sums, origin_x, origin_y), rule)
-        step = _step(following, current, origin_y, typical)
-        current, iterations = following, iterations + 1
+
+    def improve(transform: Sim3, stride: int, converged: float) -> tuple[Sim3, int]:
+        iterations, step = 0, np.inf
+        while step >= converged and iterations < config.max_iterations:
+            sums = kernels.accumulate(x, y, w, loss_unit, _affine(transform), huber, origin_x, origin_y, stride)
+            following = umeyama.solve(_moments(sums, origin_x, origin_y), rule)
+            step = _step(following, transform, origin_y, typical)
+            transform, iterations = following, iterations + 1
+        return transform, iterations
+
+    if len(pairs) >= _COARSE_MIN_POINTS:
+        current, _ = improve(current, _COARSE_STRIDE, _COARSE_CONVERGED)
+    current, iterations = improve(current, 1, _CONVERGED)
     centre = current.act(origin_x)
-    residuals, sums = kernels.score(x, y, w, unit, _affine(current), config.huber_relative, np.inf, centre)
-    median = float(np.median(residuals))
+    residuals, second = kernels.score(x, y, w, unit, _affine(current), config.huber_relative, centre)
+    median = _median(residuals)
     sigma = max(median / _MEDIAN_OF_NORM, _SIGMA_FLOOR)
-    independent = min(_INDEPENDENT_POINTS_PER_FRAME * frame_count, len(x)) / len(x)
-    normal = _normal_equations(sums / float(w.mean(dtype=np.float64))) * independent / sigma**2
-    require_determined(about(normal, -centre), centre, typical, MAX_SIGMA, fix_scale=fix_scale)
+    independent = min(_INDEPENDENT_POINTS_PER_FRAME * pairs.frame_count, len(pairs)) / float(w.sum(dtype=np.float64))
+    information = about(_normal_equations(second) * independent / sigma**2, -centre)
+    require_determined(information, centre, typical, _MAX_SIGMA, fix_scale=fix_scale)
     return Sim3Estimate(
         current,
         float(np.mean(residuals <= config.inlier_relative)),
         median,
-        about(normal, -centre),
+        information,
         centre,
         typical,
-        len(x),
+        len(pairs),
         iterations,
     )
 
 
-def residual_statistics(
-    points_i: npt.NDArray[np.floating],
-    points_j: npt.NDArray[np.floating],
-    depth_j: npt.NDArray[np.floating],
-    j_from_i: Sim3,
-    config: RegistrationConfig,
-) -> tuple[float, float]:
-    """Inlier ratio and median depth-relative residual of valid points under any transform."""
-    relative = np.linalg.norm(j_from_i.act(points_i) - points_j, axis=1) / depth_j
-    return float(np.mean(relative <= config.inlier_relative)), float(np.median(relative))
+def residual_statistics(pairs: PointPairs, j_from_i: Sim3, config: RegistrationConfig) -> tuple[float, float]:
+    """Inlier ratio and median depth-relative residual under any transform."""
+    from vggt_motion.registration import kernels
+
+    x, y, w, unit = pairs.in_i, pairs.in_j, pairs.weight, pairs.inverse_depth
+    residuals, _ = kernels.score(x, y, w, unit, _affine(j_from_i), config.huber_relative, np.zeros(3))
+    return float(np.mean(residuals <= config.inlier_relative)), _median(residuals)
 
 
-def _valid(
-    points_i: npt.NDArray[np.floating],
-    points_j: npt.NDArray[np.floating],
-    weights: npt.NDArray[np.floating],
-    depth_j: npt.NDArray[np.floating],
-    config: RegistrationConfig,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """The usable points, their weights and inverse depths, contiguous float32."""
-    count = len(points_i)
-    if (
-        points_i.shape != (count, 3)
-        or points_j.shape != (count, 3)
-        or weights.shape != (count,)
-        or depth_j.shape != (count,)
-    ):
-        raise ValueError(f"shapes do not fit: {points_i.shape}, {points_j.shape}, {weights.shape}, {depth_j.shape}")
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        x, y = (np.ascontiguousarray(points, dtype=np.float32) for points in (points_i, points_j))
-        w, depth = weights.astype(np.float32), depth_j.astype(np.float32)
-        # a sum is not finite if and only if a term is not, short of overflow, which is as unusable
-        valid = np.isfinite(x.sum(axis=1) + y.sum(axis=1) + w + depth) & (w > 0.0) & (depth > 0.0)
-        inverse = 1.0 / depth
-    usable = int(np.count_nonzero(valid))
-    if usable < config.min_points:
-        raise RegistrationError(f"{usable} valid points, at least {config.min_points} are needed")
-    if usable == count:
-        return x, y, w, inverse
-    return x[valid], y[valid], w[valid], inverse[valid]
+def _median(values: npt.NDArray[np.float32]) -> float:
+    """Median of values (N,), of an even choice of them where they are many."""
+    return float(np.median(values[:: max(1, len(values) // _MEDIAN_POINTS)]))
 
 
 def _affine(transform: Sim3) -> Array:
@@ -195,68 +200,4 @@ def _normal_equations(sums: Array) -> Array:
     out[3:6, 3:6] = total * np.eye(3)
     out[3:6, 6] = out[6, 3:6] = first
     out[6, 6] = trace
-    return out
-
-
-def uncertainty(information: Array, centre: Array, typical_depth: float, *, fix_scale: bool) -> Array:
-    """Standard deviations (7,) of rotation (rad), translation (typical depths) and log-scale about a point of frame j.
-
-    Args:
-        information: (7, 7) of a left perturbation in frame j.
-        centre: (3,) point about which the parts are told apart, the middle of the points.
-        typical_depth: unit of the translation.
-        fix_scale: the log-scale is known.
-
-    Raises:
-        RegistrationError: some part is not determined at all.
-    """
-    covariance = _covariance(about(information, centre), typical_depth, fix_scale=fix_scale)
-    return np.sqrt(np.diag(covariance))
-
-
-def require_determined(
-    information: Array, centre: Array, typical_depth: float, limit: Array, *, fix_scale: bool
-) -> None:
-    """Refuse a transform of which some part is guessed; arguments as of :func:`uncertainty`, ``limit`` in its units.
-
-    Raises:
-        RegistrationError: names the part.
-    """
-    sigma = uncertainty(information, centre, typical_depth, fix_scale=fix_scale)
-    worst = int(np.argmax(sigma / limit))
-    if sigma[worst] > limit[worst]:
-        part = ("rotation", "translation", "scale")[worst // 3]
-        amount = f"{np.degrees(sigma[worst]):.1f} degrees" if worst < 3 else f"{100 * sigma[worst]:.0f} %"
-        raise RegistrationError(f"the {part} is uncertain by {amount}")
-
-
-def with_floor(information: Array, centre: Array, typical_depth: float, floor: Array, *, fix_scale: bool) -> Array:
-    """The information (7, 7) after independent errors of standard deviations ``floor`` (7,) are added.
-
-    Arguments as of :func:`uncertainty`; the floor is in its units, about its centre.
-    """
-    covariance = _covariance(about(information, centre), typical_depth, fix_scale=fix_scale) + np.diag(floor**2)
-    unit = _units(typical_depth)
-    return about(np.linalg.inv(covariance) / np.outer(unit, unit), -centre)
-
-
-def about(information: Array, centre: Array) -> Array:
-    """Information (7, 7) of the perturbation about ``centre`` instead of about the origin of the frame."""
-    to_origin = Sim3(np.eye(3), centre, 1.0).adjoint()
-    return np.asarray(to_origin.T @ information @ to_origin, dtype=np.float64)
-
-
-def _units(typical_depth: float) -> Array:
-    return np.array([1.0] * 3 + [typical_depth] * 3 + [1.0])
-
-
-def _covariance(centred: Array, typical_depth: float, *, fix_scale: bool) -> Array:
-    size = 6 if fix_scale else 7
-    unit = _units(typical_depth)
-    scaled = (centred * np.outer(unit, unit))[:size, :size]
-    eigenvalues, vectors = np.linalg.eigh(scaled)
-    if not np.isfinite(eigenvalues).all() or eigenvalues[0] <= _SINGULAR * eigenvalues[-1]:
-        raise RegistrationError("the points do not determine the transform")
-    out = np.zeros((7, 7))
-    out[:size, :size] = (vectors / eigenvalues) @ vectors.T
     return out
