@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -136,6 +138,33 @@ def test_a_killed_recorder_goes_on_where_it_was(tmp_path: Path, session: Session
         wait_for(lambda: is_caught_up(live, third, session.frame_count), "catching up")
         assert third.stop() == 0
         assert sum(map(len, assert_complete(tmp_path / "run.mcap", live, session).values())) == count
+
+
+def test_kills_at_any_moment_lose_and_repeat_nothing(tmp_path: Path, session: Session) -> None:
+    """The recorder is killed again and again while frames and records come in."""
+    seed = 7
+    moments = np.random.default_rng(seed).uniform(0.0, 0.4, 4)
+    with live_session(tmp_path, recorder={"flush_interval_s": 0.05}) as live:
+        publisher = camera(live, history=session.frame_count)
+
+        def drive() -> None:
+            for index in range(session.frame_count):
+                publish(publisher, session, range(index, index + 1))
+                time.sleep(0.05)
+
+        feeders = [threading.Thread(target=drive), threading.Thread(target=live.append, args=(session,))]
+        recorder = live.started("recorder", "--directory", str(tmp_path))
+        for feeder in feeders:
+            feeder.start()
+        for moment in moments:
+            time.sleep(moment)
+            recorder.kill()
+            recorder = live.started("recorder", "--directory", str(tmp_path))
+        for feeder in feeders:
+            feeder.join()
+        wait_for(lambda: is_caught_up(live, recorder, session.frame_count), f"catching up (seed {seed})")
+        assert recorder.stop() == 0, recorder.text()
+        assert_complete(tmp_path / "run.mcap", live, session)
 
 
 def test_keyframes_that_never_came_are_taken_from_the_ledger(tmp_path: Path, session: Session) -> None:

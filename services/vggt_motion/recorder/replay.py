@@ -20,7 +20,7 @@ from vggt_motion.sources.source import Frame
 from vggt_motion.sources.timing import NANOSECONDS
 
 _log = logging.getLogger(__name__)
-_HISTORY = 8  # for a subscriber that joins while the first frames go out
+_HISTORY = 64  # frames that a receiver which joins late still gets
 
 
 @dataclass(frozen=True)
