@@ -318,7 +318,9 @@ class LocalRun:
         newest = max(state.keyframes.values(), key=lambda keyframe: keyframe.frame_index, default=None)
         predicted = {index for index, _ in state.submaps}
         ended = state.stream_ended
-        frames = int(ended.detail["frame_count"]) if ended is not None else int(counters.get("frames", 0))
+        # The log is ahead of the frontend's health, which comes once a second.
+        seen = max(int(counters.get("frames", 0)), newest.frame_index + 1 if newest is not None else 0)
+        frames = int(ended.detail["frame_count"]) if ended is not None else seen
         return Progress(
             frame_count=self._frame_count,
             frames=frames,

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from vggt_motion import launch, results
 from vggt_motion.bus.jobs import JobClient
@@ -57,7 +57,7 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     run = launch.LocalRun(request)
     finished = _claim_folder(request, run, fresh=fresh)
     if finished is not None and (reference is None or "ground_truth" in finished):
-        console.print(f"This run is finished already (in {request.out}); --fresh runs it again.")
+        console.print(f"This run is finished already (in {escape(str(request.out))}); --fresh runs it again.")
         _summarise(console, request.out, finished)
         return int(finished["exit_code"])
 
@@ -78,7 +78,7 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
         console.print("Interrupted. The same command continues from here.")
         return INTERRUPTED_EXIT_CODE
     if outcome.exit_code == SourceTruncatedError.exit_code:
-        console.print(f"The input ended early: {metrics['truncated']}")
+        console.print(f"The input ended early: {escape(metrics['truncated'])}")
     return outcome.exit_code
 
 
@@ -144,7 +144,7 @@ def _display(console: Console, source: str) -> Iterator[Callable[[launch.Progres
         transient=True,
     )
     last = {"text": ""}
-    console.print(source)
+    console.print(escape(source))
     with bar:
         task = bar.add_task("starting", total=None, what="")
 
@@ -172,9 +172,6 @@ def _display(console: Console, source: str) -> Iterator[Callable[[launch.Progres
 
 
 def _summarise(console: Console, out: Path, metrics: dict[str, Any]) -> None:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
     length = next(((name, value) for name, value in metrics.items() if name.startswith("path_length_")), None)
     rows = [
         ("frames", f"{metrics['frame_count']}, of them {metrics['keyframe_count']} keyframes"),
@@ -203,8 +200,8 @@ def _summarise(console: Console, out: Path, metrics: dict[str, Any]) -> None:
         )
     rows.append(("time", f"{metrics['wall_seconds']:.1f} s, of them {metrics['start_up_seconds']:.1f} s start-up"))
     rows.append(("results", str(out)))
+    width = max(len(name) for name, _ in rows)
     for name, value in rows:
-        table.add_row(name, value)
-    console.print(table)
+        console.print(f"[bold]{name:<{width}}[/bold]  {escape(value)}")
     for line in metrics["warnings"]:
-        console.print(f"warning: {line}", style="yellow")
+        console.print(f"[yellow]warning[/yellow]: {escape(line)}")
