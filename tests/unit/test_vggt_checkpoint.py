@@ -176,7 +176,7 @@ class TestWhereWeightsComeFrom:
 
 
 class FakeHub:
-    """The two calls of huggingface-hub 0.24 to 2.4 that are used, with its exceptions."""
+    """The two calls of huggingface-hub that are used, with its exceptions."""
 
     class EntryNotFoundError(Exception):
         pass
