@@ -49,13 +49,14 @@ class _Pair:
     score: float  # larger is a better seed
 
 
-def grow(observations: Observations, frame_count: int, camera: Scene) -> Grown | None:
+def grow(observations: Observations, frame_count: int, camera: Scene, calibration: Calibration) -> Grown | None:
     """Place as many frames as possible.
 
     Args:
         observations: of all frames, in time order.
         frame_count: number of frames.
-        camera: its shared camera is held; its poses and points are ignored.
+        camera: its shared camera is the start; its poses and points are ignored.
+        calibration: of the focal length, which follows the frames as soon as they turn.
 
     Returns:
         None where no two neighbouring frames have a geometry.
@@ -65,18 +66,15 @@ def grow(observations: Observations, frame_count: int, camera: Scene) -> Grown |
     pairs = {a: pair for a, pair in found.items() if pair is not None}
     if not pairs:
         return None
-    seed = _best_seed(observations, rays, pairs, frame_count, camera)
-    if seed is None:
-        return None
-    growing = seed
-    while not growing.registered.all():
-        placed = _place_next(growing, observations, rays, pairs)
+    growing = _best_seed(observations, pairs, frame_count, camera)
+    while growing is not None and not growing.registered.all():
+        placed = _place_next(growing, observations, pairs)
         if placed is None:
             break
         growing = placed
         count = int(growing.registered.sum())
         if count % 3 == 0 or growing.registered.all():
-            growing = settle(growing, observations, rays, iterations=4, robust_px=2.0)
+            growing = settle(growing, observations, calibration, iterations=5, robust_px=2.0)
     return growing
 
 
@@ -87,25 +85,29 @@ def rays_of(observations: Observations, camera: Scene) -> Array:
     return np.stack(undistort_rays(x, y, camera.radial_k1), axis=1)
 
 
-def settle(growing: Grown, observations: Observations, rays: Array, iterations: int, robust_px: float) -> Grown:
-    """Triangulate everything that the registered frames see, and adjust with the shared camera held."""
-    scene, seen = retriangulate(growing.scene, observations, rays, growing.registered, robust_px, 6.0 * robust_px)
+def settle(
+    growing: Grown, observations: Observations, calibration: Calibration, iterations: int, robust_px: float
+) -> Grown:
+    """Triangulate everything that the registered frames see, and adjust; the focal length too where they turn."""
+    scene, seen = retriangulate(growing.scene, observations, growing.registered, robust_px, 6.0 * robust_px)
     if len(seen.frame) == 0:
         return growing
+    turns = growing.registered.sum() > 3 and not bundle.looks_one_way(scene.rotations[growing.registered])
+    follows = replace(calibration, free=(calibration.free[0] and bool(turns), False, False, False))
     fixed = int(np.argmax(growing.registered))
-    adjusted = bundle.adjust(scene, seen, _HELD, robust_px, 1.0, iterations, 1e-4, fixed)
+    adjusted = bundle.adjust(scene, seen, follows, robust_px, 1.0, iterations, 1e-4, fixed)
     return Grown(adjusted.scene, growing.registered)
 
 
 def retriangulate(
-    scene: Scene, observations: Observations, rays: Array, registered: Mask, robust_px: float, gate_px: float
+    scene: Scene, observations: Observations, registered: Mask, robust_px: float, gate_px: float
 ) -> tuple[Scene, Observations]:
     """New points for the scene's cameras, and the observations in registered frames that fit them."""
     seen = observations.subset(registered[observations.frame])
     points, valid = triangulate(
         scene.rotations,
         scene.translations,
-        rays[registered[observations.frame]],
+        rays_of(seen, scene),
         seen.start,
         seen.frame,
         robust_px / scene.focal_px,
@@ -168,9 +170,7 @@ def two_view_depths(rays_a: Array, rays_b: Array, rotation: Array, translation: 
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
 
 
-def _best_seed(
-    observations: Observations, rays: Array, pairs: dict[int, _Pair], frame_count: int, camera: Scene
-) -> Grown | None:
+def _best_seed(observations: Observations, pairs: dict[int, _Pair], frame_count: int, camera: Scene) -> Grown | None:
     """The neighbours that start best: three where possible, judged by how many of their observations fit."""
     best: tuple[float, Grown] | None = None
     for a in sorted(pairs, key=lambda key: -pairs[key].score)[:_SEED_CANDIDATES]:
@@ -179,11 +179,11 @@ def _best_seed(
         registered = np.zeros(frame_count, dtype=np.bool_)
         registered[[a, a + 1]] = True
         scene = replace(camera, rotations=rotations, translations=translations, points=np.zeros((0, 3)))
-        growing = settle(Grown(scene, registered), observations, rays, iterations=10, robust_px=1.0)
+        growing = settle(Grown(scene, registered), observations, _HELD, iterations=10, robust_px=1.0)
         for _ in range(2):
-            placed = _place_next(growing, observations, rays, pairs)
+            placed = _place_next(growing, observations, pairs)
             if placed is not None:
-                growing = settle(placed, observations, rays, iterations=10, robust_px=1.0)
+                growing = settle(placed, observations, _HELD, iterations=10, robust_px=1.0)
         among = observations.subset(growing.registered[observations.frame])
         repeated = among.subset((np.diff(among.start) >= min(3, int(growing.registered.sum())))[among.point])
         errors = np.linalg.norm(bundle.residuals(growing.scene, repeated), axis=1)
@@ -193,9 +193,10 @@ def _best_seed(
     return best[1] if best is not None else None
 
 
-def _place_next(growing: Grown, observations: Observations, rays: Array, pairs: dict[int, _Pair]) -> Grown | None:
+def _place_next(growing: Grown, observations: Observations, pairs: dict[int, _Pair]) -> Grown | None:
     """Register the neighbouring frame that sees most of the known points; None where none can be placed."""
     scene, registered = growing.scene, growing.registered
+    rays = rays_of(observations, scene)
     known = _known_points(growing, observations)
     candidates = []
     for frame in range(len(registered)):
@@ -222,7 +223,7 @@ def _place_next(growing: Grown, observations: Observations, rays: Array, pairs: 
             continue
         more = registered.copy()
         more[frame] = True
-        scene, _ = retriangulate(placed, observations, rays, more, 1.0, 6.0)
+        scene, _ = retriangulate(placed, observations, more, 1.0, 6.0)
         return Grown(scene, more)
     return None
 

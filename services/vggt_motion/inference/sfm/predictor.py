@@ -14,7 +14,7 @@ from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics
 from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints
 from vggt_motion.inference.sfm import depth as dense
-from vggt_motion.inference.sfm import images, rotation, structure, tracks, verdict
+from vggt_motion.inference.sfm import globalmap, images, rotation, structure, tracks, verdict
 from vggt_motion.inference.sfm.bundle import Scene
 from vggt_motion.inference.sfm.focal import CameraPrior
 from vggt_motion.inference.sfm.library import load_pycolmap
@@ -95,8 +95,7 @@ class _Submap:
             return self._rotation_only(turned, working)
         # 4. structure
         started = time.perf_counter()
-        solved, attempts = structure.solve(followed, originals, working, self._prior())
-        self._attempts.extend(attempts)
+        solved = self._solve(followed, originals, working)
         self._seconds["structure_s"] = time.perf_counter() - started
         if solved is None:
             return self._failed("structure from motion found no scene that the keyframes agree on")
@@ -108,6 +107,39 @@ class _Submap:
         frames = self._frames(solved, working)
         self._seconds["depth_s"] = time.perf_counter() - started
         return self._prediction(frames, judgement, reason, self._quality(solved, len(frames), working))
+
+    def _solve(
+        self, followed: tracks.Tracks, originals: Sequence[int], working: images.WorkingImages
+    ) -> structure.Structure | None:
+        """The structure; where the fast way leaves doubts, also by matched features, grown and mapped at once."""
+        prior = self._prior()
+        solved, attempts = structure.solve(followed, originals, working, prior)
+        self._attempts.extend(attempts)
+        if solved is not None and verdict.judge(solved, len(originals))[0] is SubmapVerdict.GOOD:
+            return solved
+        candidates = [solved]
+        matched = tracks.match(working, originals)
+        again, attempts = structure.solve(matched, originals, working, prior)
+        self._attempts.extend(f"matched features, {attempt}" for attempt in attempts)
+        candidates.append(again)
+        if len(originals) > 2 and (again is None or verdict.judge(again, len(originals))[0] is not SubmapVerdict.GOOD):
+            known = prior.focal_over_width if prior.focal_over_width is not None else _FALLBACK_FOCAL_OVER_WIDTH
+            placed = globalmap.place(
+                matched,
+                originals,
+                working.width_px,
+                working.height_px,
+                known * working.width_px,
+                prior.is_sure,
+                self._config.sfm.seed,
+            )
+            mapped, outcome = None, "no model"
+            if placed is not None:
+                mapped, outcome = structure.solve_from(matched, originals, working, prior, placed)
+            self._attempts.append(f"matched features, global mapping: {outcome}")
+            candidates.append(mapped)
+        found = [candidate for candidate in candidates if candidate is not None]
+        return max(found, key=lambda candidate: verdict.rank(candidate, len(originals))) if found else None
 
     def _prior(self) -> CameraPrior:
         hint = self._hint

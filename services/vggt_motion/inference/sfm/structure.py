@@ -7,6 +7,7 @@ unexplained.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.inference.sfm import alignment, bundle, focal, growth
+from vggt_motion.inference.sfm import alignment, bundle, focal, globalmap, growth
 from vggt_motion.inference.sfm.bundle import Calibration, Observations, Scene
 from vggt_motion.inference.sfm.focal import CameraPrior
 from vggt_motion.inference.sfm.images import GreyImage, WorkingImages
@@ -23,7 +24,7 @@ from vggt_motion.inference.sfm.tracks import Tracks
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-_REGROW_RELATIVE = 0.12  # a focal length that moved so far is grown from once more
+_REGROW_RELATIVE = 0.05  # a focal length that moved so far is grown from once more
 _GOOD_EXPLAINED = 0.75  # share of observations that fit: no further start is tried
 _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong distortion is believed
 _CAPPED_PX = 20.0
@@ -46,6 +47,8 @@ class Structure:
     median_parallax_deg: float
     focal_relative_sigma: float  # as this submap alone sees it; inf where held
     cost: float  # capped robust cost of all observations, to compare solutions of the same tracks by
+    weakest_share: float  # least share, over steps between frames, of the points followed over it that fit in both
+    weakest_link: int  # least number, over steps, of points that carry the scale: seen on both sides, twice on one
 
     def camera_from_submap(self) -> dict[int, Array]:
         """Position of each registered frame -> (4, 4)."""
@@ -72,10 +75,7 @@ def solve(
         the best solution, None where there is none; and one line for each way that was tried.
     """
     width_px = working.width_px
-    centre = np.array([0.5 * (width_px - 1), 0.5 * (working.height_px - 1)])
-    index = np.full(max(positions) + 1, -1)
-    index[list(positions)] = np.arange(len(positions))
-    observations = Observations.build(tracks.point, index[tracks.frame], tracks.pixel - centre, tracks.count)
+    observations = _observations(tracks, positions, working)
     calibration = prior.calibration(width_px)
     best: Structure | None = None
     attempts = []
@@ -104,6 +104,31 @@ def solve(
     return _in_unit_steps(polished), attempts
 
 
+def solve_from(
+    tracks: Tracks, positions: Sequence[int], working: WorkingImages, prior: CameraPrior, placed: globalmap.Placed
+) -> tuple[Structure | None, str]:
+    """Solve a submap from poses that another method found; also one line about the outcome."""
+    observations = _observations(tracks, positions, working)
+    registered = np.array([position in placed.camera_from_submap for position in positions])
+    poses = np.stack([placed.camera_from_submap.get(position, np.eye(4)) for position in positions])
+    nothing = np.zeros((0, 3))
+    scene = Scene(poses[:, :3, :3].copy(), poses[:, :3, 3].copy(), nothing, placed.focal_px, prior.radial_k1)
+    calibration = prior.calibration(working.width_px)
+    solved = _adjusted(observations, registered, positions, scene, calibration)
+    if solved is not None:
+        images = [working.grey[p] for p in positions]
+        solved = _in_unit_steps(_polished(solved, observations, images, working.usable, calibration))
+    return solved, _outcome(solved, working.width_px)
+
+
+def _observations(tracks: Tracks, positions: Sequence[int], working: WorkingImages) -> Observations:
+    """Observations by index of the frame, relative to the middle of the image."""
+    centre = np.array([0.5 * (working.width_px - 1), 0.5 * (working.height_px - 1)])
+    index = np.full(max(positions) + 1, -1)
+    index[list(positions)] = np.arange(len(positions))
+    return Observations.build(tracks.point, index[tracks.frame], tracks.pixel - centre, tracks.count)
+
+
 def _polished(
     solved: Structure,
     observations: Observations,
@@ -116,8 +141,7 @@ def _polished(
     fixed = int(np.argmax(solved.registered))
     for robust_px, gate_px, iterations, tolerance in _POLISH:
         again = alignment.remeasure(scene, observations, fitting, solved.registered, images, usable)
-        rays = growth.rays_of(again, scene)
-        refined, fits = growth.retriangulate(scene, again, rays, solved.registered, robust_px, gate_px)
+        refined, fits = growth.retriangulate(scene, again, solved.registered, robust_px, gate_px)
         if np.bincount(fits.frame, minlength=len(solved.registered))[solved.registered].min() < _MIN_FRAME_OBSERVATIONS:
             break
         scene = bundle.adjust(
@@ -128,6 +152,8 @@ def _polished(
         _described(scene, fitting, observations, solved.registered, solved.positions, calibration),
         explained=solved.explained,
         cost=solved.cost,
+        weakest_share=solved.weakest_share,
+        weakest_link=solved.weakest_link,
     )
 
 
@@ -172,7 +198,7 @@ def _from_start(
 ) -> Structure | None:
     nothing = np.zeros((0, 3))
     camera = Scene(np.zeros((0, 3, 3)), nothing, nothing, focal_over_width * width_px, prior.radial_k1)
-    grown = growth.grow(observations, len(positions), camera)
+    grown = growth.grow(observations, len(positions), camera, calibration)
     if grown is None:
         return None
     return _adjusted(observations, grown.registered, positions, grown.scene, calibration)
@@ -188,8 +214,7 @@ def _adjusted(
     fixed = int(np.argmax(registered))
     fitting = observations
     for robust_px, gate_px, iterations, tolerance in _STAGES:
-        rays = growth.rays_of(observations, scene)
-        scene, fitting = growth.retriangulate(scene, observations, rays, registered, robust_px, gate_px)
+        scene, fitting = growth.retriangulate(scene, observations, registered, robust_px, gate_px)
         if len(fitting.frame) < 4 * registered.sum():
             return None
         scene = bundle.adjust(
@@ -209,6 +234,7 @@ def _described(
     residuals = np.linalg.norm(bundle.residuals(scene, fitting), axis=1)
     everything = np.linalg.norm(bundle.residuals(scene, observations), axis=1)
     information = bundle.shared_information(scene, fitting, calibration, _STAGES[-1][0], int(np.argmax(registered)))
+    weakest_share, weakest_link = _weakest(fitting, observations, registered)
     return Structure(
         positions=positions,
         registered=registered,
@@ -219,7 +245,28 @@ def _described(
         median_parallax_deg=_median_parallax_deg(scene, fitting),
         focal_relative_sigma=focal.relative_sigma(information, calibration),
         cost=float(np.log1p(np.minimum(everything, _CAPPED_PX) ** 2).sum()),
+        weakest_share=weakest_share,
+        weakest_link=weakest_link,
     )
+
+
+def _weakest(fitting: Observations, observations: Observations, registered: npt.NDArray[np.bool_]) -> tuple[float, int]:
+    """The weakest step of the chain: see :class:`Structure`."""
+    frames = np.flatnonzero(registered)
+    count = len(fitting.start) - 1
+    seen = np.zeros((2, len(registered), count), dtype=np.bool_)
+    for row, some in enumerate((fitting, observations)):
+        seen[row, some.frame, some.point] = True
+    fits = np.cumsum(seen[0], axis=0)
+    shares, links = [1.0], []
+    for a, b in itertools.pairwise(frames):
+        followed = int((seen[1, a] & seen[1, b]).sum())
+        if followed > 0:
+            shares.append(int((seen[0, a] & seen[0, b]).sum()) / followed)
+        before, after = fits[a], fits[-1] - fits[a]
+        carries = (before >= 1) & (after >= 1) & (before + after >= 3)
+        links.append(int(carries.sum()))
+    return min(shares), min(links) if links else 0
 
 
 def _median_parallax_deg(scene: Scene, observations: Observations) -> float:

@@ -29,8 +29,10 @@ _WINDOW_PX = 15
 _PYRAMID_LEVELS = 1
 _ROUND_TRIP_PX = 0.7
 _BORDER_PX = 4
-_MIN_FOLLOWED = 80  # fewer tracks over a step are helped out by feature matches
+_MIN_FOLLOWED = 130  # fewer tracks over a step are helped out by feature matches
 _SAME_POINT_PX = 1.0
+_MIN_EPIPOLAR_MATCHES = 16
+_EPIPOLAR_PX = 1.5
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,45 @@ def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
             followed, landed = np.concatenate([followed, matched_ids]), np.concatenate([landed, at_b])
         ids, pixels = followed, landed
     return _assemble(rows)
+
+
+def match(working: WorkingImages, positions: Sequence[int], reach: int = 4) -> Tracks:
+    """Tracks of features matched between all frames up to ``reach`` apart: slower than following, but sure-footed."""
+    detected = {position: features.detect(working.grey[position], working.usable) for position in positions}
+    offset = dict(zip(positions, np.cumsum([0, *(len(detected[p].points) for p in positions)]), strict=False))
+    total = sum(len(found.points) for found in detected.values())
+    parent = np.arange(total)
+
+    def root(node: int) -> int:
+        while parent[node] != node:
+            parent[node] = parent[parent[node]]
+            node = int(parent[node])
+        return node
+
+    for index, a in enumerate(positions):
+        for b in positions[index + 1 : index + 1 + reach]:
+            rows = features.match(detected[a], detected[b])
+            agreeing = _epipolar_inliers(detected[a].points[rows[:, 0]], detected[b].points[rows[:, 1]])
+            for row_a, row_b in rows[agreeing]:
+                first, second = root(int(offset[a] + row_a)), root(int(offset[b] + row_b))
+                parent[max(first, second)] = min(first, second)
+    roots = np.array([root(node) for node in range(total)], dtype=np.int64)
+    frame = np.concatenate([np.full(len(detected[p].points), p) for p in positions])
+    pixel = np.concatenate([detected[p].points for p in positions])
+    # a track that shows twice in one frame holds two points at least
+    seen, count = np.unique(np.stack([roots, frame], axis=1), axis=0, return_counts=True)
+    ambiguous = np.isin(roots, seen[count > 1, 0])
+    kept = ~ambiguous
+    rows_by_frame = [(roots[kept & (frame == p)], int(p), pixel[kept & (frame == p)]) for p in positions]
+    return _assemble(rows_by_frame)
+
+
+def _epipolar_inliers(at_a: Points, at_b: Points) -> npt.NDArray[np.bool_]:
+    if len(at_a) < _MIN_EPIPOLAR_MATCHES:
+        return np.zeros(len(at_a), dtype=np.bool_)
+    cv2.setRNGSeed(0)  # the generator is the library's own and remembers earlier calls
+    _, mask = cv2.findFundamentalMat(at_a, at_b, cv2.USAC_ACCURATE, _EPIPOLAR_PX, 0.999, 2000)
+    return np.zeros(len(at_a), dtype=np.bool_) if mask is None else np.asarray(mask.ravel() > 0)
 
 
 def _rejoin(

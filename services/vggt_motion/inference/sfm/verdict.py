@@ -15,6 +15,8 @@ _GOOD_REPROJECTION_PX = 0.75
 _GOOD_REGISTERED = 0.8
 _GOOD_PARALLAX_DEG = 0.3
 _GOOD_FRAME_OBSERVATIONS = 15
+_GOOD_SHARE = 0.4
+_GOOD_LINK = 25
 
 
 def judge(solved: Structure, keyframe_count: int) -> tuple[SubmapVerdict, str]:
@@ -45,4 +47,15 @@ def judge(solved: Structure, keyframe_count: int) -> tuple[SubmapVerdict, str]:
     fewest = int(np.bincount(solved.observations.frame, minlength=len(solved.registered))[solved.registered].min())
     if fewest < _GOOD_FRAME_OBSERVATIONS:
         reasons.append(f"a keyframe hangs on {fewest} observations")
+    if solved.weakest_share < _GOOD_SHARE:
+        reasons.append(f"over one step only {solved.weakest_share:.0%} of the tracks fit")
+    if registered > 2 and solved.weakest_link < _GOOD_LINK:
+        reasons.append(f"over one step only {solved.weakest_link} points carry the scale")
     return (SubmapVerdict.LOW_QUALITY if reasons else SubmapVerdict.GOOD), "; ".join(reasons)
+
+
+def rank(solved: Structure, keyframe_count: int) -> tuple[int, int, float]:
+    """Sorts solutions of the same keyframes: the verdict, then how many were registered, then how much is explained."""
+    order = (SubmapVerdict.FAILED, SubmapVerdict.LOW_QUALITY, SubmapVerdict.GOOD)
+    judgement, _ = judge(solved, keyframe_count)
+    return order.index(judgement), int(solved.registered.sum()), solved.explained
