@@ -1,8 +1,8 @@
 """Numerics in a child process, so that the process loop that answers the bus is never held up (DESIGN section 4).
 
 A GTSAM solve or a structure-from-motion run can hold the interpreter for seconds; heartbeats, health and shutdown must
-not wait for it. The child is spawned (forking after Zenoh is open is unsafe), kept between calls so that imports are paid
-once, and ends with its parent, however the parent ends.
+not wait for it. The child is spawned (forking after Zenoh is open is unsafe), kept between calls so that imports are
+paid once, and ends with its parent, however the parent ends.
 """
 
 from __future__ import annotations
