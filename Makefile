@@ -69,12 +69,16 @@ lint: $(DEV) ## Check style, types and the wire contract
 	buf lint
 
 .PHONY: test
-test: lint ## Run the checks and all tests but the slow ones
-	pytest -m 'not slow' $(PYTEST_ARGS)
+test: lint ## Run the checks and all tests but the long ones
+	pytest -m 'not slow and not faults' $(PYTEST_ARGS)
 
 .PHONY: test-slow
 test-slow: $(DEV) ## Run the slow tests
 	pytest -m slow $(PYTEST_ARGS)
+
+.PHONY: test-faults
+test-faults: $(DEV) ## Kill, freeze, cut and fill up the services for an hour
+	pytest -m faults $(PYTEST_ARGS)
 
 .PHONY: proto
 proto: $(DEV) ## Generate the code of the wire contract

@@ -172,6 +172,13 @@ class ForeignConfig(Section):
     device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d{1,2})?)$")
 
 
+class RecordedConfig(Section):
+    """The predictor ``recorded``: geometry of an earlier run, for tests and scale runs."""
+
+    ledger: Path | None = Field(None, description="folder of that run's ledger")
+    seconds_per_submap: float = Field(0.0, ge=0, description="a prediction takes at least so long")
+
+
 class SkyConfig(Section):
     """Sky that is kept out of depth and confidence."""
 
@@ -204,6 +211,7 @@ class InferenceConfig(Section):
     pi3x: ForeignConfig = ForeignConfig(model="yyfz233/Pi3X")
     depth_anything_3: ForeignConfig = ForeignConfig(model="depth-anything/DA3NESTED-GIANT-LARGE-1.1")
     map_anything: ForeignConfig = ForeignConfig(model="facebook/map-anything-apache")
+    recorded: RecordedConfig = RecordedConfig()
     sky: SkyConfig = SkyConfig()
 
 

@@ -9,7 +9,7 @@ import logging
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -21,7 +21,7 @@ from vggt_motion.bus.session import Bus, open_bus
 from vggt_motion.config import BusConfig, Config
 from vggt_motion.errors import BusError, InputError, VggtMotionError
 from vggt_motion.ledger.sessions import SessionIdentity
-from vggt_motion.records import HealthReport, MotionState
+from vggt_motion.records import HealthReport, MotionState, Stream
 from vggt_motion.sources.registry import open_source
 from vggt_motion.sources.source import Source
 from vggt_motion.supervise import ServiceCommand, Supervisor
@@ -31,6 +31,8 @@ _TICK_S = 0.05
 _STATUS_INTERVAL_S = 0.5
 _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
+_RECORDER_QUIET_S = 2.0  # no frame for so long: those that are missing went by while no recorder was there
+_LOG_PATIENCE_S = 5.0  # what the frontend appended last is seen here after this at the latest
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
 LOG_FOLDER = "logs"
@@ -274,8 +276,10 @@ class LocalRun:
         """Fold the log until the final graph is there and the recorder has it all, or until Ctrl-C."""
         state = LogState()
         follower = LogFollower(bus)
+        recorded = _RecorderProgress(watch, is_enabled=self.config.recorder.enabled)
         next_status = 0.0
         finished_at: float | None = None
+        absent_since: float | None = None
         try:
             while not self._interrupts:
                 supervisor.poll()
@@ -285,10 +289,15 @@ class LocalRun:
                 if now >= next_status:
                     next_status = now + _STATUS_INTERVAL_S
                     on_progress(self._progress(state, watch))
+                is_absent = state.stream_ended is None and supervisor.exit_code("frontend") is not None
+                absent_since = (absent_since or now) if is_absent else None
+                if absent_since is not None and now - absent_since > _LOG_PATIENCE_S:
+                    _log.warning("the frontend was ended before its input was, starting it again")
+                    supervisor.start(["frontend"])
                 graph = state.latest_graph()
                 if graph is not None and graph.is_final and supervisor.exit_code("frontend") is not None:
                     finished_at = finished_at or now
-                    if self._is_recorded(watch, follower, state):
+                    if recorded.is_complete(state, follower.positions(), now):
                         break
                     if now - finished_at > _RECORDER_TIMEOUT_S:
                         _log.warning("the recorder did not catch up in time; the recording may lack its end")
@@ -298,19 +307,6 @@ class LocalRun:
         finally:
             follower.close()
         return state
-
-    def _is_recorded(self, watch: ServiceWatch, follower: LogFollower, state: LogState) -> bool:
-        if not self.config.recorder.enabled:
-            return True
-        report = _newest(watch, "recorder")
-        if report is None:
-            return False
-        ended = state.stream_ended
-        frame_count = int(ended.detail["frame_count"]) if ended is not None else 0
-        positions = follower.positions()
-        return report.counters.get("frames", 0) >= frame_count and all(
-            report.counters.get(f"position_{stream.value}", 0) >= position for stream, position in positions.items()
-        )
 
     def _progress(self, state: LogState, watch: ServiceWatch) -> Progress:
         frontend = _newest(watch, "frontend")
@@ -333,6 +329,37 @@ class LocalRun:
             dead_jobs=len(state.dead_jobs),
             is_input_complete=state.is_input_complete,
         )
+
+
+class _RecorderProgress:
+    """Whether the recorder has everything that it can have."""
+
+    def __init__(self, watch: ServiceWatch, *, is_enabled: bool) -> None:
+        self._watch = watch
+        self._is_enabled = is_enabled
+        self._frame_count = -1.0
+        self._quiet_since = 0.0
+
+    def is_complete(self, state: LogState, positions: Mapping[Stream, int], now: float) -> bool:
+        if not self._is_enabled:
+            return True
+        report = _newest(self._watch, "recorder")
+        if report is None:
+            self._frame_count = -1.0
+            return False
+        frame_count = report.counters.get("frames", 0.0)
+        if frame_count != self._frame_count:
+            self._frame_count, self._quiet_since = frame_count, now
+        if any(report.counters.get(f"position_{stream.value}", 0) < position for stream, position in positions.items()):
+            return False
+        ended = state.stream_ended
+        wanted = int(ended.detail["frame_count"]) if ended is not None else 0
+        if frame_count >= wanted:
+            return True
+        if now - self._quiet_since < _RECORDER_QUIET_S:
+            return False
+        _log.warning("frames are missing in the recording", extra={"missing": wanted - int(frame_count)})
+        return True
 
 
 def _newest(watch: ServiceWatch, service: str) -> HealthReport | None:

@@ -77,7 +77,7 @@ class Supervisor:
         self.stop()
 
     def start(self, labels: Sequence[str] | None = None) -> None:
-        """Start the named processes, or all that do not run yet."""
+        """Start the named processes, or all that do not run at present; also what ended by itself."""
         for label, child in self._children.items():
             if child.process is None and (labels is None or label in labels):
                 self._start(child)
@@ -144,6 +144,7 @@ class Supervisor:
 
     def _start(self, child: _Child) -> None:
         command = child.command
+        child.exit_code = None
         arguments = [sys.executable, "-m", "vggt_motion", "serve", *command.arguments, "--parent-pid", str(os.getpid())]
         with self.log_file(command.label).open("ab") as log:
             # A group of its own: Ctrl-C on the terminal reaches only us, and we decide who ends when.

@@ -131,3 +131,12 @@ def test_a_process_ends_when_its_parent_was_killed(tmp_path: Path) -> None:
         time.sleep(0.05)
     os.kill(pid, signal.SIGKILL)
     pytest.fail("the process outlived its parent")
+
+
+def test_one_that_ended_by_itself_can_be_started_again(tmp_path: Path, environment: dict[str, str]) -> None:
+    with Supervisor([command("end", "0", ends_by_itself=True)], tmp_path, environment) as supervisor:
+        supervisor.start()
+        poll_until(supervisor, lambda: supervisor.exit_code("end") is not None)
+        supervisor.start(["end"])
+        assert supervisor.exit_code("end") is None
+        poll_until(supervisor, lambda: supervisor.exit_code("end") == 0)

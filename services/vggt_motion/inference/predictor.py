@@ -91,6 +91,7 @@ _REGISTRY: dict[str, str] = {
     "pi3x": "vggt_motion.inference.pi3:create_x",
     "depth_anything_3": "vggt_motion.inference.depth_anything:create",
     "map_anything": "vggt_motion.inference.map_anything:create",
+    "recorded": "vggt_motion.inference.recorded:create",
 }
 AUTO = "auto"
 
