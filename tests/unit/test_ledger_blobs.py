@@ -26,7 +26,7 @@ def blobs(tmp_path: Path) -> BlobFiles:
 
 
 def stored_file(tmp_path: Path, data: bytes) -> Path:
-    return tmp_path / "blobs" / digest(data)[:2] / digest(data)
+    return tmp_path / "blobs" / digest(data)
 
 
 @given(contents=st.lists(st.binary(max_size=200), max_size=5))
@@ -112,6 +112,55 @@ def test_writes_at_the_same_time_do_not_overshoot_the_reserve_together(tmp_path:
     both_ask.wait()
     writer.join()
     assert list(store.names()) == [digest(bytes(700))]
+
+
+class GatedFiles(FileOperations):
+    """Holds the first sync of the folder of blobs until it is released; may let it fail."""
+
+    def __init__(self) -> None:
+        self.release = threading.Event()
+        self.release.set()
+        self.sync_count = 0
+        self.fails = False
+
+    def sync_folder(self, folder: Path) -> None:
+        if folder.name == "blobs":
+            self.sync_count += 1
+            is_first = not self.release.is_set() and self.sync_count == 1
+            self.release.wait(10)
+            if is_first and self.fails:
+                raise OSError(errno.EIO, "injected")
+        super().sync_folder(folder)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_writes_at_the_same_time_share_the_sync_of_their_names(tmp_path: Path, fails: bool) -> None:
+    files = GatedFiles()
+    store = BlobFiles(tmp_path / "blobs", files=files)
+    files.release.clear()
+    files.sync_count, files.fails = 0, fails
+    outcomes: dict[int, object] = {}
+
+    def put(number: int) -> None:
+        try:
+            outcomes[number] = store.put([number.to_bytes(4, "little")], keep_free_bytes=0)
+        except LedgerError as error:
+            outcomes[number] = error
+
+    threads = [threading.Thread(target=put, args=(number,)) for number in range(8)]
+    threads[0].start()
+    while files.sync_count == 0:
+        time.sleep(0.001)
+    for thread in threads[1:]:
+        thread.start()
+    while store._sync_names._asked < 8:
+        time.sleep(0.001)
+    files.release.set()
+    for thread in threads:
+        thread.join()
+    assert files.sync_count == 2, "the second one stands for the seven that came during the first"
+    assert isinstance(outcomes[0], LedgerError) == fails, "who waited does not share the failure of another"
+    assert [isinstance(outcomes[number], list) for number in range(1, 8)] == [True] * 7
 
 
 class FailingFiles(FileOperations):
@@ -262,8 +311,7 @@ def test_the_crash_model_notices_a_missing_sync(tmp_path: Path) -> None:
 
     class Forgetful(CrashingDisk):
         def sync_folder(self, folder: Path) -> None:
-            if folder.name == "blobs":
-                super().sync_folder(folder)
+            pass
 
     disk = Forgetful()
     BlobFiles(tmp_path / "before" / "blobs", files=disk).put([b"lost"], keep_free_bytes=0)

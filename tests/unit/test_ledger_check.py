@@ -34,7 +34,7 @@ def entry(data: bytes) -> BlobEntry:
 
 def blob_path(directory: Path, data: bytes) -> Path:
     name = entry(data).sha256
-    return directory / "blobs" / name[:2] / name
+    return directory / "blobs" / name
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_a_torn_write_ahead_log_is_recovered_and_reported(session: Path, tmp_pat
     image.mkdir()
     (image / "ledger.db").write_bytes((session / "ledger.db").read_bytes())
     (image / "ledger.db-wal").write_bytes((session / "ledger.db-wal").read_bytes()[: size + 5000])
-    for path in (session / "blobs").glob("??/*"):
+    for path in (session / "blobs").glob("*[0-9a-f]"):
         target = image / path.relative_to(session)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(path.read_bytes())
@@ -124,7 +124,10 @@ def test_a_damaged_blob_is_named_set_aside_and_healed_by_appending_again(session
         ("UPDATE records SET payload = x'00' WHERE record_id = 'k1'", "keyframe/1 ('k1'): the record is not what was"),
         ("UPDATE records SET record_id = 'other' WHERE record_id = 'k1'", "keyframe/1 ('other'): the record is not"),
         ("DELETE FROM records WHERE record_id = 'k0'", "keyframe: records 0 to 0 are missing"),
-        ("DELETE FROM record_blobs; DELETE FROM records WHERE record_id = 'k1'", "keyframe: the last 1 records are missing"),
+        (
+            "DELETE FROM record_blobs; DELETE FROM records WHERE record_id = 'k1'",
+            "keyframe: the last 1 records are missing",
+        ),
     ],
 )
 def test_a_damaged_row_is_named(session: Path, statement: str, problem: str) -> None:

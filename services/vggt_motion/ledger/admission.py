@@ -6,12 +6,11 @@ cannot be decoded would be passed over by every follower for ever, after it was 
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 from vggt_motion.bus import calls, codec
 from vggt_motion.errors import CodecError, RefusalCode, RequestRefusedError
-from vggt_motion.ledger.store import BlobEntry, InvalidRequestError, NewRecord
+from vggt_motion.ledger.store import Blob, BlobEntry, InvalidRequestError, NewRecord
 from vggt_motion.records import (
     Constraint,
     Event,
@@ -23,8 +22,8 @@ from vggt_motion.records import (
 )
 
 
-def admitted_record(request: calls.AppendRequest) -> NewRecord:
-    """The record of a request.
+def admitted(request: calls.AppendRequest) -> tuple[NewRecord, list[Blob], list[BlobEntry]]:
+    """The record of a request, its new blobs, and the blobs that it refers to.
 
     Raises:
         RequestRefusedError: an unknown stream, or not a record of this stream under this id.
@@ -41,19 +40,16 @@ def admitted_record(request: calls.AppendRequest) -> NewRecord:
         raise InvalidRequestError(f"record_id '{request.record_id}' is not that of the record, '{_record_id(record)}'")
     if set(request.blob_refs) != set(codec.blob_refs(record)):
         raise InvalidRequestError(f"blob_refs of '{request.record_id}' are not what the record refers to")
-    _check_blobs(request, record)
-    return NewRecord(
+    blobs = [Blob.of(data) for data in request.blobs]
+    _check_blobs(request, record, blobs)
+    admitted_record = NewRecord(
         stream=request.stream,
         record_id=request.record_id,
         payload_type=request.payload_type,
         payload=request.payload,
         identity_sha256=request.identity_sha256,
     )
-
-
-def references(request: calls.AppendRequest) -> list[BlobEntry]:
-    """The blobs that the record of a request refers to, as the rows know them."""
-    return [BlobEntry(ref.sha256, ref.size_bytes) for ref in request.blob_refs]
+    return admitted_record, blobs, [BlobEntry(ref.sha256, ref.size_bytes) for ref in request.blob_refs]
 
 
 def known_stream(name: str) -> Stream:
@@ -79,18 +75,18 @@ def _record_id(record: Any) -> str:
     raise TypeError(f"{type(record).__name__} is not a record of the log")
 
 
-def _check_blobs(request: calls.AppendRequest, record: Any) -> None:
-    refs = {ref.sha256: ref for ref in request.blob_refs}
+def _check_blobs(request: calls.AppendRequest, record: Any, blobs: list[Blob]) -> None:
+    known = {ref.sha256 for ref in request.blob_refs}
     shapes = {}
     if isinstance(record, SubmapGeometry):
         shapes = {
             frame.depth.sha256: (frame.intrinsics.height_px, frame.intrinsics.width_px) for frame in record.frames
         }
-    for blob in request.blobs:
-        sha256 = hashlib.sha256(blob).hexdigest()
-        if sha256 not in refs:
+    for blob in blobs:
+        sha256 = blob.entry.sha256
+        if sha256 not in known:
             raise InvalidRequestError(f"'{request.record_id}' brings a blob that it does not refer to: {sha256}")
         if sha256 in shapes:
-            depth, _ = codec.decode_depth(blob)
+            depth, _ = codec.decode_depth(blob.data)
             if depth.shape != shapes[sha256]:
                 raise CodecError(f"depth blob {sha256}: {depth.shape} in place of {shapes[sha256]} (height, width)")

@@ -1,7 +1,7 @@
-"""Blobs as files named by their content: ``blobs/ab/abcdef...``.
+"""Blobs as files named by their content: ``blobs/abcdef...``.
 
 A blob is written under ``blobs/incoming``, forced to the disk, renamed to its name and its folder forced to the disk;
-only then does a row refer to it. So a name under ``blobs/ab`` always stands for whole content, whatever was killed;
+only then does a row refer to it. So a name under ``blobs`` always stands for whole content, whatever was killed;
 what was torn is under ``incoming`` and is removed at the next start. The hash is verified on every read, because disks
 do rot.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import itertools
 import logging
 import os
@@ -20,7 +19,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from vggt_motion.errors import DiskFullError, LedgerError
-from vggt_motion.ledger.store import BlobEntry, DamagedBlobError, InvalidRequestError, UnknownError, reserve_line
+from vggt_motion.ledger.store import (
+    Blob,
+    BlobEntry,
+    DamagedBlobError,
+    InvalidRequestError,
+    UnknownError,
+    reserve_line,
+    sha256_hex,
+)
 
 _LOGGER = logging.getLogger(__name__)
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -68,9 +75,38 @@ def free_space(folder: Path) -> int:
     return stat.f_bavail * stat.f_frsize
 
 
-def sha256_hex(data: bytes) -> str:
-    """SHA-256 as 64 lower-case hexadecimal digits."""
-    return hashlib.sha256(data).hexdigest()
+class _FolderSync:
+    """Forces the entries of one folder to the disk, once for all threads that ask while a sync is under way."""
+
+    def __init__(self, folder: Path, files: FileOperations) -> None:
+        self._folder = folder
+        self._files = files
+        self._condition = threading.Condition()
+        self._asked = 0
+        self._done = 0  # every entry that was made before so many asked is durable
+        self._is_running = False
+
+    def __call__(self) -> None:
+        """Return when every entry that the caller made before is durable."""
+        with self._condition:
+            self._asked += 1
+            ticket = self._asked
+            while self._is_running and self._done < ticket:
+                self._condition.wait()
+            if self._done >= ticket:
+                return
+            self._is_running = True
+            covered = self._asked
+        is_synced = False
+        try:
+            self._files.sync_folder(self._folder)
+            is_synced = True
+        finally:
+            with self._condition:
+                self._is_running = False
+                if is_synced:
+                    self._done = max(self._done, covered)
+                self._condition.notify_all()
 
 
 class BlobFiles:
@@ -99,41 +135,35 @@ class BlobFiles:
         self._files = files or FileOperations()
         self._free_bytes = free_bytes or (lambda: free_space(folder))
         self._counter = itertools.count()
+        # One folder for all names, so that many writes share the sync of its entries.
+        self._sync_names = _FolderSync(folder, self._files)
         self._lock = threading.Lock()
         self._claimed_bytes = 0  # of writes that are under way: many at once must not overshoot the reserve together
         try:
             make_folder(self._incoming, self._files)
-            # All of them now: a later one would have to be forced to the disk by every thread that uses it.
-            for prefix in range(256):
-                (folder / f"{prefix:02x}").mkdir(exist_ok=True)
-            self._files.sync_folder(folder)
             for leftover in self._incoming.iterdir():
                 leftover.unlink()
         except OSError as error:
             raise LedgerError(f"cannot use {folder} for blobs: {error.strerror or error}") from error
 
-    def put(self, blobs: Sequence[bytes], *, keep_free_bytes: int) -> list[BlobEntry]:
+    def put(self, blobs: Sequence[bytes | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
         """Make blobs durable, in order; see :meth:`.store.Blobs.put`."""
-        entries = [BlobEntry(sha256_hex(data), len(data)) for data in blobs]
+        hashed = [Blob.of(data) for data in blobs]
         # An existing file is read again: that its name is there does not say that the disk kept its content.
-        missing = {
-            entry.sha256: data
-            for entry, data in zip(entries, blobs, strict=True)
-            if not self._is_sound(entry.sha256, entry.size_bytes)
-        }
-        size_bytes = sum(map(len, missing.values()))
+        missing = {blob.entry: blob.data for blob in hashed if not self._is_sound(blob.entry)}
+        size_bytes = sum(entry.size_bytes for entry in missing)
         with self._space(size_bytes, keep_free_bytes):
             try:
-                for sha256, data in missing.items():
-                    self._write(sha256, data)
+                for entry, data in missing.items():
+                    self._write(entry.sha256, data)
                 # Also for known blobs: another thread, or a process that was killed, may have renamed them only.
-                for folder in sorted({self._path(entry.sha256).parent for entry in entries}):
-                    self._files.sync_folder(folder)
+                if hashed:
+                    self._sync_names()
             except OSError as error:
                 if error.errno in _NO_SPACE:
                     raise DiskFullError(f"no space for {size_bytes} bytes in {self._folder}") from error
                 raise LedgerError(f"cannot write to {self._folder}: {error.strerror or error}") from error
-        return entries
+        return [blob.entry for blob in hashed]
 
     def get(self, sha256: str) -> bytes:
         """The bytes, verified; see :meth:`.store.Blobs.get`. Damaged ones are set aside; appending heals them."""
@@ -162,10 +192,7 @@ class BlobFiles:
 
     def names(self) -> Iterator[str]:
         """SHA-256 of every stored file, in order, whether a record refers to it or not."""
-        for folder in sorted(path for path in self._folder.iterdir() if re.fullmatch(r"[0-9a-f]{2}", path.name)):
-            for path in sorted(folder.iterdir()):
-                if _SHA256.fullmatch(path.name) and path.name.startswith(folder.name):
-                    yield path.name
+        yield from sorted(path.name for path in self._folder.iterdir() if _SHA256.fullmatch(path.name))
 
     def size_bytes(self, sha256: str) -> int:
         """Size of a stored file."""
@@ -203,13 +230,13 @@ class BlobFiles:
         # The name comes from outside: it must never lead out of the folder.
         if not _SHA256.fullmatch(sha256):
             raise InvalidRequestError(f"'{sha256[:80]}' is not a SHA-256 in lower-case hexadecimal digits")
-        return self._folder / sha256[:2] / sha256
+        return self._folder / sha256
 
-    def _is_sound(self, sha256: str, size_bytes: int) -> bool:
-        if not self.has(sha256, size_bytes):
+    def _is_sound(self, entry: BlobEntry) -> bool:
+        if not self.has(entry.sha256, entry.size_bytes):
             return False
         try:
-            return sha256_hex(self._path(sha256).read_bytes()) == sha256
+            return sha256_hex(self._path(entry.sha256).read_bytes()) == entry.sha256
         except OSError:
             return False
 

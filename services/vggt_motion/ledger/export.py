@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from vggt_motion.errors import InputError, LedgerError
-from vggt_motion.ledger.blobs import BlobFiles, FileOperations, sha256_hex
+from vggt_motion.ledger.blobs import BlobFiles, FileOperations
 from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, locked
 from vggt_motion.ledger.sqlite import copy_database, read_only
-from vggt_motion.ledger.store import BlobEntry
+from vggt_motion.ledger.store import BlobEntry, sha256_hex
 
 _MAX_BLOB_BYTES = 2**30
 
@@ -57,7 +57,7 @@ def export_session(directory: Path, archive: Path) -> ExportReport:
             # Blobs never change and are never removed while a record refers to them: no lock is needed.
             blobs = directory / BLOBS_NAME
             for entry in entries:
-                _add(tar, entry, blobs / entry.sha256[:2] / entry.sha256)
+                _add(tar, entry, blobs / entry.sha256)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         FileOperations().rename(partial, archive)
@@ -111,7 +111,7 @@ def _import(archive: Path, directory: Path) -> ExportReport:
             if member.size > _MAX_BLOB_BYTES:
                 raise InputError(f"cannot import {archive}: a blob of {member.size} bytes")
             (entry,) = blobs.put([content.read()], keep_free_bytes=0)
-            if PurePosixPath(member.name) != PurePosixPath(BLOBS_NAME, entry.sha256[:2], entry.sha256):
+            if PurePosixPath(member.name) != PurePosixPath(BLOBS_NAME, entry.sha256):
                 raise InputError(f"cannot import {archive}: '{member.name[:80]}' is damaged or not of a session")
             found.add(entry)
     if not snapshot.is_file():
@@ -133,7 +133,7 @@ def _add(tar: tarfile.TarFile, entry: BlobEntry, path: Path) -> None:
         raise LedgerError(f"blob {entry.sha256} is missing; run a check") from None
     if BlobEntry(sha256_hex(data), len(data)) != entry:
         raise LedgerError(f"blob {entry.sha256} is damaged; run a check")
-    info = tarfile.TarInfo(f"{BLOBS_NAME}/{entry.sha256[:2]}/{entry.sha256}")
+    info = tarfile.TarInfo(f"{BLOBS_NAME}/{entry.sha256}")
     info.size = len(data)
     info.mode = 0o644
     tar.addfile(info, io.BytesIO(data))

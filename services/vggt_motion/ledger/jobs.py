@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 from vggt_motion.ledger.log import MAX_PAYLOAD_TYPE_BYTES, Store, check_id, check_record
 from vggt_motion.ledger.store import (
+    Blob,
     BlobEntry,
     ConflictError,
     InvalidRequestError,
@@ -215,7 +216,7 @@ class JobQueue:
         job_id: str,
         lease_id: str,
         record: NewRecord,
-        blobs: Sequence[bytes] = (),
+        blobs: Sequence[bytes | Blob] = (),
         references: Sequence[BlobEntry] = (),
     ) -> Done:
         """Append the result of a job and make the job done, in one transaction.

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from vggt_motion.errors import DiskFullError
 from vggt_motion.ledger.store import (
+    Blob,
     BlobEntry,
     Blobs,
     ConflictError,
@@ -83,7 +84,9 @@ class Store:
         self._input_streams = frozenset(input_streams)
         self._time_ns = time_ns
 
-    def append(self, record: NewRecord, blobs: Sequence[bytes] = (), references: Sequence[BlobEntry] = ()) -> Appended:
+    def append(
+        self, record: NewRecord, blobs: Sequence[bytes | Blob] = (), references: Sequence[BlobEntry] = ()
+    ) -> Appended:
         """Make a record durable, with its blobs.
 
         Args:
@@ -98,13 +101,17 @@ class Store:
             DiskFullError: not enough space; nothing was changed.
         """
         check_record(record)
-        known = self._rows.read(lambda reader: self._find_known(reader, record))
-        if known is not None and self._has_all(known.stream, known.sequence):
-            return Appended(known.sequence, was_known=True)
+        # A look before blobs are written or space is asked for: what is there already needs neither.
+        if blobs or not self.is_accepting:
+            known = self._rows.read(lambda reader: self._find_known(reader, record))
+            if known is not None and self._has_all(known.stream, known.sequence):
+                return Appended(known.sequence, was_known=True)
         entries = self.put_blobs(blobs, references, is_input=record.stream in self._input_streams)
         return self._rows.write(lambda transaction: self.add(transaction, record, entries))
 
-    def put_blobs(self, blobs: Sequence[bytes], references: Sequence[BlobEntry], *, is_input: bool) -> list[BlobEntry]:
+    def put_blobs(
+        self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool
+    ) -> list[BlobEntry]:
         """Make the blobs of a record durable before its row; returns every blob that the record refers to."""
         if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
             raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")

@@ -26,7 +26,7 @@ from vggt_motion.errors import (
     RequestRefusedError,
     VggtMotionError,
 )
-from vggt_motion.ledger.admission import admitted_record, known_stream, references
+from vggt_motion.ledger.admission import admitted, known_stream
 from vggt_motion.ledger.directory import Ledger
 from vggt_motion.ledger.jobs import JobPolicy
 from vggt_motion.ledger.store import NewRecord, RecordRow, reserve_line
@@ -56,6 +56,7 @@ _TICK_S = 0.25
 _HEALTH_S = 1.0
 _SIZES_S = 5.0  # the sum over all blobs is not asked for more often
 _HISTORY = 16
+_GATHER_S = 0.002  # acknowledgements go out first, and what comes together is read from the log together
 _FEW_WAITERS = 32
 _CROWDED_WAIT_S = 1.0
 _VANISHED_GRACE_S = 0.2
@@ -262,6 +263,7 @@ class LogPublisher:
     def _run(self) -> None:
         while not self._is_closed:
             self._wake.wait()
+            time.sleep(_GATHER_S)
             self._wake.clear()
             try:
                 self._publish()
@@ -316,7 +318,7 @@ class Desk:
             (bus.keys.rpc("jobs", "cancel"), _FEW_THREADS, lambda _, payload: self.cancel(payload)),
         ]
         for key, threads, handler in handlers:
-            yield bus.serve(key, self._guarded(handler), threads=threads)
+            yield bus.serve(key, self.guarded(handler), threads=threads)
 
     def close(self) -> None:
         """From now on, a call that fails because the session is closed may be repeated elsewhere."""
@@ -325,8 +327,7 @@ class Desk:
     def append(self, payload: bytes) -> bytes:
         """``@rpc/ledger/append``."""
         request = codec.decode(calls.AppendRequest, payload)
-        record = admitted_record(request)
-        appended = self._ledger.store.append(record, request.blobs, references(request))
+        appended = self._ledger.store.append(*admitted(request))
         self._wake_publisher()
         return codec.encode(calls.AppendReply(appended.sequence, appended.was_known))
 
@@ -398,10 +399,7 @@ class Desk:
     def done(self, payload: bytes) -> bytes:
         """``@rpc/jobs/done``."""
         request = codec.decode(calls.DoneRequest, payload)
-        result = request.result
-        done = self._ledger.jobs.done(
-            request.job_id, request.lease_id, admitted_record(result), result.blobs, references(result)
-        )
+        done = self._ledger.jobs.done(request.job_id, request.lease_id, *admitted(request.result))
         self._wake_publisher()
         return codec.encode(calls.DoneReply(done.outcome, done.sequence))
 
@@ -436,7 +434,9 @@ class Desk:
                 self._sizes_until_s = time.monotonic() + _SIZES_S
             return self._stored_bytes
 
-    def _guarded(self, handler: Callable[[str, bytes], bytes]) -> Callable[[str, bytes], bytes]:
+    def guarded(self, handler: Callable[[str, bytes], bytes]) -> Callable[[str, bytes], bytes]:
+        """A handler whose refusals are counted, and whose store may fail."""
+
         def guarded(key: str, payload: bytes) -> bytes:
             try:
                 return handler(key, payload)

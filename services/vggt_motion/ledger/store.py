@@ -10,8 +10,9 @@ Policy (what is idempotent, when a job is dead) lives in :mod:`.log` and :mod:`.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 from vggt_motion.errors import RefusalCode, RequestRefusedError
@@ -48,6 +49,21 @@ class BlobEntry:
 
     sha256: str  # 64 lower-case hexadecimal digits
     size_bytes: int
+
+
+@dataclass(frozen=True)
+class Blob:
+    """Bytes with their hash, so that it is computed once on their way through the ledger."""
+
+    entry: BlobEntry
+    data: bytes = field(repr=False)
+
+    @classmethod
+    def of(cls, data: bytes | Blob) -> Blob:
+        """Bytes, hashed if they are not yet."""
+        if isinstance(data, Blob):
+            return data
+        return cls(BlobEntry(sha256_hex(data), len(data)), data)
 
 
 @dataclass(frozen=True)
@@ -220,7 +236,7 @@ class Rows(Protocol):
 class Blobs(Protocol):
     """Durable bytes, addressed by their SHA-256."""
 
-    def put(self, blobs: Sequence[bytes], *, keep_free_bytes: int) -> list[BlobEntry]:
+    def put(self, blobs: Sequence[bytes | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
         """Make blobs durable, in order; durable on return. Known ones are not stored twice.
 
         Raises:
@@ -240,6 +256,11 @@ class Blobs(Protocol):
 
     def free_bytes(self) -> int:
         """Space left for more."""
+
+
+def sha256_hex(data: bytes) -> str:
+    """SHA-256 as 64 lower-case hexadecimal digits."""
+    return hashlib.sha256(data).hexdigest()
 
 
 def reserve_line(free_bytes: int, keep_free_bytes: int) -> str:
