@@ -7,8 +7,10 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import pytest
+
 from bus_processes import connect, free_port, running, wait_until
-from vggt_motion.bus.pubsub import Publisher
+from vggt_motion.bus.pubsub import MAX_HISTORY, Publisher
 from vggt_motion.bus.session import Bus, Sample
 
 
@@ -169,3 +171,41 @@ def test_a_closed_subscription_is_silent_and_closing_twice_is_fine(endpoint: str
         assert len(got.samples) == count
         publisher.close()
         publisher.close()
+
+
+def test_the_longest_history_fits_while_nobody_reads_yet(endpoint: str) -> None:
+    """Replies of the history come in before the subscription is there; they must not wait for a reader."""
+    with connect(endpoint) as sender:
+        publisher = sender.publisher(sender.keys.image("front"), blocking=True, history=MAX_HISTORY)
+        put_all(publisher, range(MAX_HISTORY), 20_000)
+        for _ in range(10):
+            with connect(endpoint) as receiver:
+                got = Collector()
+                receiver.subscribe(receiver.keys.all_images(), got, history=True)
+                wait_until(lambda got=got: got.numbers() == list(range(MAX_HISTORY)))
+        with pytest.raises(ValueError, match="longer than"):
+            sender.publisher(sender.keys.image("rear"), blocking=True, history=MAX_HISTORY + 1)
+
+
+def test_a_subscription_that_is_closed_while_it_is_full_leaves_nothing_blocked(endpoint: str) -> None:
+    with connect(endpoint) as sender:
+        publisher = sender.publisher(sender.keys.image("front"), blocking=True)
+        feeder = threading.Thread(target=put_all, args=(publisher, range(300), 200_000), daemon=True)
+        receivers = []
+        for _ in range(4):
+            receiver, release = connect(endpoint), threading.Event()
+            receiver.subscribe(receiver.keys.all_images(), lambda _, release=release: release.wait(60))
+            receivers.append((receiver, release))
+        feeder.start()
+        time.sleep(0.5)  # channels and links fill up
+        for receiver, release in receivers:
+            release.set()
+            receiver.close()
+        feeder.join(60)
+        assert not feeder.is_alive()
+        opened: list[Bus] = []
+        opener = threading.Thread(target=lambda: opened.append(connect(endpoint)), daemon=True)
+        opener.start()
+        opener.join(60)
+        assert opened, "the process cannot open a session any more"
+        opened[0].close()

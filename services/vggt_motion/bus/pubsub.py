@@ -16,6 +16,11 @@ from vggt_motion.errors import BusError, BusUnavailableError
 
 _log = logging.getLogger(__name__)
 _FIFO_CAPACITY = 8  # the default of 256 messages would be a gigabyte of images
+# With history, replies come in while the subscriber is still being declared and nobody can read yet. If they do not
+# fit, the declaration never returns (seen under load: 64 messages of history against a channel of 8), and a blocking
+# publisher stands still with it. So what a publisher keeps must fit, with room for what is published meanwhile.
+MAX_HISTORY = 64
+_HISTORY_FIFO_CAPACITY = 4 * MAX_HISTORY
 _LATEST_CAPACITY = 1
 # Recovery asks the publishers; their heartbeats alone bring nothing back after a restart of the router (Zenoh 1.10).
 _RECOVERY_INTERVAL = timedelta(seconds=1)
@@ -48,6 +53,8 @@ class Publisher:
     """Publishes on one key. Thread-safe."""
 
     def __init__(self, session: zenoh.Session, key: str, *, blocking: bool, history: int, encoding: str) -> None:
+        if history > MAX_HISTORY:
+            raise ValueError(f"{key}: a history of {history} messages is longer than {MAX_HISTORY}")
         congestion = zenoh.CongestionControl.BLOCK if blocking else zenoh.CongestionControl.DROP
         self.is_closed = False
         self._key = key
@@ -113,7 +120,8 @@ class Subscription:
         latest_only: bool,
         history: bool,
     ) -> None:
-        channel: Any = handlers.RingChannel(_LATEST_CAPACITY) if latest_only else handlers.FifoChannel(_FIFO_CAPACITY)
+        capacity = _HISTORY_FIFO_CAPACITY if history else _FIFO_CAPACITY
+        channel: Any = handlers.RingChannel(_LATEST_CAPACITY) if latest_only else handlers.FifoChannel(capacity)
         self._callback = callback
         self._key = key
         self.is_closed = False

@@ -203,7 +203,7 @@ class Bus:
         Args:
             key: concrete key.
             blocking: wait for slow subscribers instead of dropping: for file images and the log only.
-            history: so many messages are kept for late and recovering subscribers.
+            history: so many messages are kept for late and recovering subscribers, at most ``pubsub.MAX_HISTORY``.
             encoding: from ``codec.encoding_of``.
         """
         return self._keep(Publisher(self._session, key, blocking=blocking, history=history, encoding=encoding))
