@@ -59,12 +59,27 @@ def test_standing_with_sensor_noise(sigma: float) -> None:
     assert keyframes[1].keyframe.zero_motion_copy_of == keyframes[0].keyframe.keyframe_id
 
 
-def test_standing_in_the_dark() -> None:
-    """A night scene: low contrast, noise of the sensor as strong as the scene's own."""
+@pytest.mark.parametrize("quality", [100, 20])
+def test_standing_in_the_dark(quality: int) -> None:
+    """A night scene: a tenth of the contrast, noise of the sensor as strong as the scene, and a codec that flickers."""
     rng = np.random.default_rng(2)
     scene = 20 + 0.1 * (texture(0) - 120)
-    traces, _ = trace(with_noise(scene, rng, 3.0) for _ in range(40))
+
+    def images() -> Iterator[np.ndarray]:
+        for _ in range(40):
+            dark = np.clip(with_noise(scene, rng, 4.0), 0, 255).astype(np.uint8)
+            data = cv2.imencode(".jpg", dark, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+            yield np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
+
+    traces, _ = trace(images())
     assert set(states(traces)) == {"S"}
+
+
+def test_driving_in_the_dark() -> None:
+    rng = np.random.default_rng(2)
+    scene = 20 + 0.1 * (texture(0) - 120)
+    traces, _ = trace(with_noise(zoomed(scene, 1.0 + 0.04 * (k % 12)), rng, 2.0) for k in range(60))
+    assert "S" not in states(traces)
 
 
 def test_standing_while_exposure_changes() -> None:
@@ -105,7 +120,9 @@ def test_driving_with_a_static_bonnet_and_overlay() -> None:
 
     traces, keyframes = trace(images())
     assert "S" not in states(traces)
-    assert len(keyframes) > 5
+    without, _ = trace(zoomed(scene, 1.0 + 0.04 * (k % 12)) for k in range(60))
+    # it hides a part of the road, but does not starve the selection
+    assert len(keyframes) > 0.5 * sum(item.is_keyframe for item in without)
 
 
 def test_driving_under_a_textured_sky_at_rest_in_the_image() -> None:

@@ -27,6 +27,7 @@ from vggt_motion.sources.source import Frame
 SHAPE = (96, 320)
 GRID = CellGrid.of(SHAPE, 320)
 USABLE = np.ones((GRID.rows, GRID.columns), np.bool_)
+NOWHERE = ~USABLE
 PIXELS = np.zeros(SHAPE, np.uint8)
 
 S, T, L = MotionState.STATIC, MotionState.TURNING, MotionState.LINEAR
@@ -46,7 +47,7 @@ def test_expansion_is_measured_against_its_closed_form() -> None:
     tracker = ParallaxTracker(GRID, SHAPE)
     tracker.restart(USABLE)
     for _ in range(5):
-        tracker.advance(_expansion(1.02), USABLE)
+        tracker.advance(_expansion(1.02), USABLE, NOWHERE)
     centre = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
     total = 1.02**5
     offsets = GRID.centres_px() - centre
@@ -61,7 +62,7 @@ def test_common_shift_counts_by_its_weight() -> None:
     tracker = ParallaxTracker(GRID, SHAPE)
     tracker.restart(USABLE)
     for _ in range(4):
-        tracker.advance(_shift(-5.0), USABLE)
+        tracker.advance(_shift(-5.0), USABLE, NOWHERE)
     assert tracker.parallax_px == pytest.approx(ROTATION_WEIGHT * 20.0, rel=1e-4)
 
 
@@ -71,29 +72,50 @@ def test_parallax_stays_right_beyond_the_image(steps: int) -> None:
     tracker = ParallaxTracker(GRID, SHAPE)
     tracker.restart(USABLE)
     for _ in range(steps):
-        tracker.advance(_shift(9.0), USABLE)
+        tracker.advance(_shift(9.0), USABLE, NOWHERE)
     assert tracker.parallax_px == pytest.approx(ROTATION_WEIGHT * 9.0 * steps, rel=1e-3)
 
 
 def test_all_points_lost_at_once_does_not_break() -> None:
     tracker = ParallaxTracker(GRID, SHAPE)
     tracker.restart(USABLE)
-    tracker.advance(_shift(1000.0), USABLE)
-    tracker.advance(_shift(3.0), USABLE)
+    tracker.advance(_shift(1000.0), USABLE, NOWHERE)
+    tracker.advance(_shift(3.0), USABLE, NOWHERE)
     assert math.isfinite(tracker.parallax_px)
     assert tracker.covisible_share == 0.0
 
 
 def test_no_usable_cells_falls_back_to_all() -> None:
     tracker = ParallaxTracker(GRID, SHAPE)
-    tracker.restart(np.zeros_like(USABLE))
-    tracker.advance(_shift(10.0), np.zeros_like(USABLE))
+    tracker.restart(NOWHERE)
+    tracker.advance(_shift(10.0), NOWHERE, NOWHERE)
     assert tracker.parallax_px == pytest.approx(3.0)
+
+
+def test_points_that_prove_to_be_fixed_to_the_camera_leave_the_median() -> None:
+    """Two thirds of the image are a bonnet that is not known at first."""
+    bonnet = NOWHERE.copy()
+    bonnet[GRID.rows // 3 :] = True
+    flow = _expansion(1.05)
+    flow[bonnet] = 0.0
+    tracker = ParallaxTracker(GRID, SHAPE)
+    tracker.restart(USABLE)
+    tracker.advance(flow, USABLE, NOWHERE)
+    starved = tracker.parallax_px
+    tracker.advance(flow, USABLE & ~bonnet, bonnet)
+    alone = ParallaxTracker(GRID, SHAPE)
+    alone.restart(~bonnet)
+    for _ in range(2):
+        alone.advance(flow, ~bonnet, bonnet)
+    assert starved == 0.0
+    assert tracker.parallax_px == pytest.approx(alone.parallax_px, rel=0.05)
+    assert tracker.parallax_px > 1.0
+    assert tracker.covisible_share <= 1.0
 
 
 def _candidates(states: list[MotionState], flow: np.ndarray) -> list[Candidate]:
     return [
-        Candidate(Frame(k, k, b"", "image/png"), PIXELS, 320, 96, state, flow if k else None, USABLE)
+        Candidate(Frame(k, k, b"", "image/png"), PIXELS, 320, 96, state, flow if k else None, USABLE, NOWHERE)
         for k, state in enumerate(states)
     ]
 

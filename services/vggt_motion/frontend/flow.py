@@ -160,3 +160,37 @@ def gradient_cells(pixels: Grey, grid: CellGrid) -> npt.NDArray[np.float32]:
     vertical = cv2.absdiff(pixels[1:], pixels[:-1])
     gradient[:-1] = cv2.add(gradient[:-1], vertical)
     return grid.mean(gradient)
+
+
+class MotionProof:
+    """Whether the flow says more than noise: it must explain the second image better than no motion does.
+
+    In the dark, and where a codec flickers, DIS finds flow of a pixel or more between images of a standing camera.
+    Where something really moves, following it takes away most of the difference between the images; where nothing
+    does, both differences are the noise. Measured: with tau = 0.8 a standing camera keeps 0.92 to 1.0 of its votes
+    static down to 8% of the contrast, where the plain ratio falls to 0.45, and no driving one gains more than 0.15.
+    """
+
+    _EXPLAINED_SHARE = 0.8
+    _EXPOSURE_PX = 13  # differences of brightness over wider areas are the camera's, not the scene's
+    _SMOOTHING_PX = 9
+
+    def __init__(self, grid: CellGrid, shape: tuple[int, ...]) -> None:
+        """Set up for working images of ``shape`` (h, w)."""
+        self._grid = grid
+        self._y, self._x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float32)
+
+    def cells(self, source: Grey, target: Grey, flow: Flow) -> npt.NDArray[np.bool_]:
+        """Where ``flow`` (h, w, 2) explains ``target`` better than no motion: cells (rows, columns) of ``source``."""
+        followed = cv2.remap(
+            target, self._x + flow[..., 0], self._y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        moved, still = self._difference(source, np.asarray(followed, np.uint8)), self._difference(source, target)
+        return np.asarray(moved < self._EXPLAINED_SHARE * still)
+
+    def _difference(self, a: Grey, b: Grey) -> npt.NDArray[np.float32]:
+        difference = a.astype(np.float32) - b
+        difference -= cv2.blur(difference, (self._EXPOSURE_PX, self._EXPOSURE_PX))
+        smooth = cv2.blur(np.abs(difference), (self._SMOOTHING_PX, self._SMOOTHING_PX))
+        size = (self._grid.columns, self._grid.rows)
+        return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA), np.float32)

@@ -39,7 +39,8 @@ class Candidate:
         height_px: of the full image.
         state: motion state.
         flow_cells: (rows, columns, 2) flow from the frame before to this one, px; None for the first frame.
-        usable: (rows, columns), cells with texture and outside the ego mask.
+        usable: (rows, columns), cells with texture that are neither masked nor fixed to the camera.
+        fixed: (rows, columns), cells that are fixed to the camera, as far as is known.
     """
 
     frame: Frame
@@ -49,6 +50,7 @@ class Candidate:
     state: MotionState
     flow_cells: Flow | None
     usable: npt.NDArray[np.bool_]
+    fixed: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -103,26 +105,25 @@ class ParallaxTracker:
         self._reached_share = 1.0
         self._lay_points(usable)
 
-    def advance(self, flow_cells: Flow, usable: npt.NDArray[np.bool_]) -> None:
+    def advance(self, flow_cells: Flow, usable: npt.NDArray[np.bool_], fixed: npt.NDArray[np.bool_]) -> None:
         """Carry the points to the next frame.
 
         Args:
             flow_cells: (rows, columns, 2) px, from the frame where the points are to the next one.
             usable: cells of the next frame, for new points.
+            fixed: cells that are known by now to be fixed to the camera: points there never were of the scene.
         """
         grid = self._grid
         lattice = (self._positions - grid.offset_px) / grid.step
-        step = cv2.remap(
-            flow_cells,
-            lattice[:, None],
-            None,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,  # type: ignore[call-overload]
-        )
+        step = cv2.remap(flow_cells, lattice[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        nearest = np.rint(lattice).astype(np.intp)
+        column, row = np.clip(nearest[:, 0], 0, grid.columns - 1), np.clip(nearest[:, 1], 0, grid.rows - 1)
+        is_scene = ~fixed[row, column]
+        self._seed_count -= len(is_scene) - int(np.count_nonzero(is_scene))
         positions = self._positions + np.asarray(step, np.float32)[:, 0]
-        inside = ((positions >= 0) & (positions <= self._limit)).all(axis=1)
+        inside = is_scene & ((positions >= 0) & (positions <= self._limit)).all(axis=1)
         self._positions, self._seeds = positions[inside], self._seeds[inside]
-        if len(self._positions) < _RESEED_SHARE * self._seed_count:
+        if len(self._positions) < _RESEED_SHARE * self._seed_count or self._seed_count <= 0:
             # the median over those that are left is the best there is for this stretch
             self._reached_px, self._reached_share = self.parallax_px, self.covisible_share
             self._lay_points(usable)
@@ -140,7 +141,7 @@ class ParallaxTracker:
     @property
     def covisible_share(self) -> float:
         """Share of the keyframe's points that are still in the image."""
-        return self._reached_share * len(self._positions) / self._seed_count
+        return self._reached_share * len(self._positions) / max(1, self._seed_count)
 
     def _lay_points(self, usable: npt.NDArray[np.bool_]) -> None:
         chosen = usable[::_STRIDE, ::_STRIDE].reshape(-1)
@@ -243,7 +244,7 @@ class KeyframeSelector:
     def push(self, candidate: Candidate) -> Iterator[Selected]:
         """Take the next frame; yields verdicts on it or on the frame before."""
         if candidate.flow_cells is not None:
-            self._tracker.advance(candidate.flow_cells, candidate.usable)
+            self._tracker.advance(candidate.flow_cells, candidate.usable, candidate.fixed)
         if self._static_pruning and candidate.state is MotionState.STATIC:
             yield from self._push_standing(candidate)
         else:
@@ -274,7 +275,7 @@ class KeyframeSelector:
                 yield self._keep_held()
                 if candidate.flow_cells is not None:
                     # the tracker was taken to this frame already; the kept frame before it is where it has to start
-                    self._tracker.advance(candidate.flow_cells, candidate.usable)
+                    self._tracker.advance(candidate.flow_cells, candidate.usable, candidate.fixed)
             self._stop_first = None
         yield from self._drop_held()
         index = candidate.frame.index

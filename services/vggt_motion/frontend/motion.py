@@ -7,7 +7,7 @@ give the same states. What decides about standing is in ``standing.py``.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ RATE_INTERVAL_S = (
 )
 
 _MIN_TEXTURED_SHARE = 0.02
+_AMBIGUOUS_RATIO = 0.2  # with fewer static cells no noise is as strong: something moves
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class FlowMeasures:
     """What the flow between the previous frame and this one says.
 
     Attributes:
-        static_ratio: share of quasi-static cells among those with texture (eq. 1 on textured cells), in [0, 1].
+        static_ratio: share of quasi-static cells among those that have a vote (eq. 1 on cells with texture whose flow
+            is either quasi-static or proven), in [0, 1].
         lateral_px: mean of |f_x| over all cells (eq. 2), px of the working image.
         yaw_px: median of f_x over the textured cells, signed, px of the working image; positive when the scene moves
             to the right, i.e. the camera turns left.
@@ -50,6 +52,7 @@ def measure_flow(
     static_flow_px: float,
     interval_s: float,
     is_repeat: bool = False,
+    prove_motion: Callable[[], npt.NDArray[np.bool_]] | None = None,
 ) -> FlowMeasures:
     """Static ratio and both turning scores of one flow field.
 
@@ -64,13 +67,20 @@ def measure_flow(
         static_flow_px: tau_flow.
         interval_s: time between the two frames, positive.
         is_repeat: the images were identical.
+        prove_motion: gives the cells (rows, columns) whose flow is more than noise; the others, if they are not
+            quasi-static, have no vote in the static ratio. Only called where that can matter.
     """
     f_x = flow_cells[..., 0]
     believed = _or_all(textured)
     columns = f_x.shape[1]
     middle = slice(columns // 4, columns - columns // 4)
+    is_static = is_quasi_static(flow_cells, static_flow_px)
+    static_ratio = float(np.mean(is_static[believed]))
+    if prove_motion is not None and _AMBIGUOUS_RATIO < static_ratio < 1.0:
+        votes = believed & (is_static | prove_motion())
+        static_ratio = float(np.mean(is_static[votes]))
     return FlowMeasures(
-        static_ratio=float(np.mean(is_quasi_static(flow_cells, static_flow_px)[believed])),
+        static_ratio=static_ratio,
         lateral_px=float(np.mean(np.abs(f_x))),
         yaw_px=float(np.median(f_x[:, middle][_or_all(textured[:, middle])])),
         interval_s=interval_s,

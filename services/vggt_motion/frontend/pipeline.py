@@ -13,9 +13,19 @@ import numpy.typing as npt
 
 from vggt_motion.config import FrontendConfig
 from vggt_motion.errors import ConfigurationError
-from vggt_motion.frontend.flow import CellGrid, DenseFlow, Flow, GreyDecoder, GreyFrame, at_width, gradient_cells
+from vggt_motion.frontend.flow import (
+    CellGrid,
+    DenseFlow,
+    Flow,
+    GreyDecoder,
+    GreyFrame,
+    MotionProof,
+    at_width,
+    gradient_cells,
+)
 from vggt_motion.frontend.keyframes import Candidate, KeyframeSelector, ParallaxTracker, Selected, create_strategy
 from vggt_motion.frontend.motion import MotionProfile, ProfileSmoother, classify, measure_flow
+from vggt_motion.frontend.overlay import OverlayDetector
 from vggt_motion.frontend.partition import Partitioner, create_rule
 from vggt_motion.frontend.standing import ShiftMeter, StandingDetector
 from vggt_motion.records import BlobRef, DropReason, FrameEntry, Keyframe, MotionState, Segment, keyframe_id
@@ -63,6 +73,7 @@ class _Waiting:
     grey: GreyFrame
     flow_cells: Flow | None
     usable: npt.NDArray[np.bool_]
+    fixed: npt.NDArray[np.bool_]
 
 
 class FrontendPipeline:
@@ -144,18 +155,24 @@ class FrontendPipeline:
             self._parts = self._fit(grey)
         parts, previous = self._parts, self._previous
         usable = (gradient_cells(grey.pixels, parts.grid) >= MIN_GRADIENT) & parts.allowed
-        measures, cells = None, None
+        measures, cells, is_fixed = None, None, ~parts.allowed
         if previous is not None:
+            flow = self._flow.between(previous.grey.pixels, grey.pixels)
+            cells = parts.grid.sample(flow)
+            interval_s = (frame.capture_time_ns - previous.frame.capture_time_ns) * 1e-9
             # the flow's own lattice is the frame before, so that one's texture says where it can be believed
-            cells = parts.grid.sample(self._flow.between(previous.grey.pixels, grey.pixels))
+            is_fixed = is_fixed | parts.overlay.update(cells, previous.usable, interval_s)
+            before, proof = previous.grey.pixels, parts.proof
             measures = measure_flow(
                 cells,
-                previous.usable,
+                previous.usable & ~is_fixed,
                 static_flow_px=self._static_flow_px,
-                interval_s=(frame.capture_time_ns - previous.frame.capture_time_ns) * 1e-9,
-                is_repeat=np.array_equal(previous.grey.pixels, grey.pixels),
+                interval_s=interval_s,
+                is_repeat=np.array_equal(before, grey.pixels),
+                prove_motion=lambda: proof.cells(before, grey.pixels, flow),
             )
-        self._previous = _Waiting(frame, grey, cells, usable)
+            usable &= ~is_fixed
+        self._previous = _Waiting(frame, grey, cells, usable, is_fixed)
         self._waiting.append(self._previous)
         self.frame_count += 1
         profile = self._smoother.push(measures)
@@ -187,14 +204,20 @@ class FrontendPipeline:
             mask = (self._ego_mask != 0).astype(np.uint8) * 255
             small = cv2.resize(mask, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
             allowed = grid.mean(np.asarray(small, np.uint8)) == 0
-        meter = ShiftMeter(self._flow, grid, self._static_flow_px)
+        proof = MotionProof(grid, shape)
+        meter = ShiftMeter(self._flow, grid, proof, self._static_flow_px)
         selector = KeyframeSelector(
             create_strategy(self._config),
             ParallaxTracker(grid, (shape[0], shape[1])),
             static_pruning=self._config.static_pruning,
         )
         return _SizedParts(
-            grid, allowed, StandingDetector(meter, self._config.static_ratio, self._static_flow_px), selector
+            grid=grid,
+            allowed=allowed,
+            proof=proof,
+            overlay=OverlayDetector(grid, self._static_flow_px),
+            standing=StandingDetector(meter, self._config.static_ratio, self._static_flow_px),
+            selector=selector,
         )
 
     def _decide(self, profile: MotionProfile) -> list[Output]:
@@ -219,6 +242,7 @@ class FrontendPipeline:
             state=state,
             flow_cells=waiting.flow_cells,
             usable=waiting.usable,
+            fixed=waiting.fixed,
         )
         return self._emit(self._parts.selector.push(candidate))
 
@@ -285,5 +309,7 @@ class _SizedParts:
 
     grid: CellGrid
     allowed: npt.NDArray[np.bool_]  # (rows, columns), outside the ego mask
+    proof: MotionProof
+    overlay: OverlayDetector
     standing: StandingDetector
     selector: KeyframeSelector

@@ -14,9 +14,10 @@ with memory, entered and left on different evidence:
   rolls on by half a metre at a light, still stands.
 
 A shift is judged by two quantiles: the median, and the upper quartile with a larger bound, for a view that is mostly
-sky and bonnet. They are blind to a bonnet, dirt and overlays of less than half, or three quarters, of the textured
-image. Sensor noise and flicker of the exposure shift DIS flow by less than 0.1 px (its patches are mean-normalised;
-measured with noise of 10 grey levels), far below tau_flow.
+sky. Who has a vote decides more than the bounds do: cells with texture, that the ego mask leaves, that were not learned
+to be fixed to the camera (``overlay.py``), and whose flow is either next to nothing or explains the image better than
+no motion (``MotionProof``). The last is what noise, compression flicker and the dark need: there DIS finds flow of a
+pixel between images of a standing camera. Changes of exposure it does not see, as its patches are mean-normalised.
 
 The two errors do not cost the same. Motion that is called standing loses poses; standing that is called straight motion
 costs next to nothing, as without parallax no frame becomes a keyframe. In doubt the camera moves.
@@ -29,7 +30,7 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.frontend.flow import CellGrid, DenseFlow, Flow, Grey
+from vggt_motion.frontend.flow import CellGrid, DenseFlow, Flow, Grey, MotionProof
 
 LOOKBACK_S = 0.5
 CHECK_INTERVAL_S = 0.2  # between two comparisons over a long baseline, which cost one or two flows each
@@ -43,9 +44,10 @@ _MIN_VOTES_SHARE = 0.05  # of all cells; with fewer votes nothing has shifted
 class ShiftMeter:
     """Tells whether the image has shifted between two frames that need not be consecutive."""
 
-    def __init__(self, flow: DenseFlow, grid: CellGrid, static_flow_px: float) -> None:
+    def __init__(self, flow: DenseFlow, grid: CellGrid, proof: MotionProof, static_flow_px: float) -> None:
         self._flow = flow
         self._grid = grid
+        self._proof = proof
         self._static_flow_px = static_flow_px
         self._centres = grid.centres_px().reshape(grid.rows, grid.columns, 2)
 
@@ -77,9 +79,13 @@ class ShiftMeter:
             median, quartile = np.percentile(lengths[votes], (50, 75))
             return bool(median > median_px or quartile > upper_quartile_px)
 
-        cells = self._grid.sample(self._flow.between(source, target))
+        flow = self._flow.between(source, target)
+        cells = self._grid.sample(flow)
         lengths = np.hypot(cells[..., 0], cells[..., 1])
-        return is_beyond(usable) and is_beyond(usable & self._returns(cells, self._flow.between(target, source)))
+        if not is_beyond(usable):
+            return False
+        votes = usable & ((lengths < self._static_flow_px) | self._proof.cells(source, target, flow))
+        return is_beyond(votes) and is_beyond(votes & self._returns(cells, self._flow.between(target, source)))
 
     def _returns(self, cells: Flow, backward: Flow) -> npt.NDArray[np.bool_]:
         """Forward-backward check: the cells whose content leads back to where it came from."""
