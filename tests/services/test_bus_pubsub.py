@@ -188,24 +188,36 @@ def test_the_longest_history_fits_while_nobody_reads_yet(endpoint: str) -> None:
 
 
 def test_a_subscription_that_is_closed_while_it_is_full_leaves_nothing_blocked(endpoint: str) -> None:
+    """Also with a reader that gives up in the middle: the process can open the next session, the publisher goes on."""
     with connect(endpoint) as sender:
         publisher = sender.publisher(sender.keys.image("front"), blocking=True)
-        feeder = threading.Thread(target=put_all, args=(publisher, range(300), 200_000), daemon=True)
-        receivers = []
-        for _ in range(4):
-            receiver, release = connect(endpoint), threading.Event()
-            receiver.subscribe(receiver.keys.all_images(), lambda _, release=release: release.wait(60))
-            receivers.append((receiver, release))
+        is_over = threading.Event()
+
+        def feed() -> None:
+            number = 0
+            while not is_over.is_set():
+                put(publisher, number, 100_000)
+                number += 1
+
+        feeder = threading.Thread(target=feed, daemon=True)
         feeder.start()
-        time.sleep(0.5)  # channels and links fill up
-        for receiver, release in receivers:
-            release.set()
-            receiver.close()
+        opened: list[Bus] = []
+
+        def open_and_give_up() -> None:
+            for _ in range(12):
+                receiver, release = connect(endpoint), threading.Event()
+                receiver.subscribe(
+                    receiver.keys.all_images(), lambda _, release=release: release.wait(60), history=True
+                )
+                time.sleep(0.1)  # channel and link fill up
+                release.set()
+                receiver.close()
+                opened.append(receiver)
+
+        opener = threading.Thread(target=open_and_give_up, daemon=True)
+        opener.start()
+        opener.join(100)
+        assert len(opened) == 12, "the process cannot open a session any more"
+        is_over.set()
         feeder.join(60)
         assert not feeder.is_alive()
-        opened: list[Bus] = []
-        opener = threading.Thread(target=lambda: opened.append(connect(endpoint)), daemon=True)
-        opener.start()
-        opener.join(60)
-        assert opened, "the process cannot open a session any more"
-        opened[0].close()
