@@ -20,9 +20,9 @@ from vggt_motion.records import DoneOutcome, JobKind, JobState, Lease
 
 # In memory where that is possible: the model asks what the rules do, other tests ask what the disk keeps.
 MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
-LEASE_S = 10.0
+LEASE_S = 10.0  # all times are sums of powers of two: no rounding decides which side of a deadline they are on
 POLICY = JobPolicy(lease_duration_s=LEASE_S, max_failures=2, max_lost_leases=3, retry_backoff_s=1.0)
-NAMES = st.sampled_from([f"job{index}" for index in range(4)])
+NAMES = st.sampled_from([f"job{index}" for index in range(8)])
 WORKERS = st.sampled_from(["inference/a", "inference/b"])
 FINAL = (JobState.DONE, JobState.DEAD, JobState.CANCELLED)
 
@@ -61,8 +61,8 @@ class QueueMachine(RuleBasedStateMachine):
     @initialize()
     def begin(self) -> None:
         self.open()
-        self.submit("job0", 1)
-        self.submit("job1", 0)
+        for number in range(6):
+            self.submit(f"job{number}", number % 2)
 
     def open(self) -> None:
         self.ledger = open_ledger(self.directory, self.clock, policy=POLICY, new_lease_id=self.new_lease_id)
@@ -87,6 +87,9 @@ class QueueMachine(RuleBasedStateMachine):
             known.state, known.not_before_s = JobState.OPEN, 0.0
 
     @rule(target=leases, worker=WORKERS)
+    def claim_one(self, worker: str) -> Lease:
+        return self.claim(worker)
+
     def claim(self, worker: str) -> Lease:
         lease = self.ledger.jobs.claim([JobKind.PREDICT], [], worker)
         ready = [
@@ -111,6 +114,9 @@ class QueueMachine(RuleBasedStateMachine):
 
     @rule(lease=leases)
     def heartbeat(self, lease: Lease) -> None:
+        self.heartbeat_of(lease)
+
+    def heartbeat_of(self, lease: Lease) -> None:
         assert self.ledger.jobs.heartbeat(lease.lease_id) == self.is_present(lease)
         if self.is_present(lease):
             self.jobs[lease.job.job_id].deadline_s = self.clock.now_s + LEASE_S
@@ -120,10 +126,35 @@ class QueueMachine(RuleBasedStateMachine):
         if lease := self.held(choice):
             self.done(lease, content)
 
-    @rule(choice=st.integers(0, 3), is_permanent=st.sampled_from([False, False, True]))
+    @rule(choice=st.integers(0, 3), is_permanent=st.sampled_from([False] * 5 + [True]))
     def fail_in_time(self, choice: int, is_permanent: bool) -> None:
         if lease := self.held(choice):
             self.fail(lease, is_permanent)
+
+    @rule(worker=WORKERS, seconds=st.sampled_from([0.5, 1.0, 1.5, 2.0]), count=st.integers(1, 3))
+    def a_worker_fails_again_and_again(self, worker: str, seconds: float, count: int) -> None:
+        for _ in range(count):
+            lease = self.claim(worker)
+            if isinstance(lease, Lease):
+                self.fail(lease, is_permanent=False)
+            self.time_passes(seconds, 1)
+
+    @rule(worker=WORKERS, count=st.integers(1, 3))
+    def a_worker_is_killed_again_and_again(self, worker: str, count: int) -> None:
+        for _ in range(count):
+            self.claim(worker)
+            self.worker_vanishes(worker)
+
+    @rule(is_failure=st.booleans())
+    def a_lease_changes_hands_and_the_old_one_is_used(self, is_failure: bool) -> None:
+        old = self.claim("inference/slow")
+        self.worker_vanishes("inference/slow")
+        self.claim("inference/b")
+        if isinstance(old, Lease):
+            if is_failure:
+                self.fail(old, is_permanent=False)
+            else:
+                self.heartbeat_of(old)
 
     def held(self, choice: int) -> Lease | None:
         """One of the leases that are valid at present."""
@@ -205,7 +236,7 @@ class QueueMachine(RuleBasedStateMachine):
             assert self.ledger.jobs.tick() == len(lost)
             self.lose(lost)
 
-    @rule(seconds=st.sampled_from([2.6, 60.0]))
+    @rule(seconds=st.sampled_from([2.75, 60.0]))
     def ledger_freezes(self, seconds: float) -> None:
         self.clock.now_s += seconds
         assert self.ledger.jobs.tick() == 0
