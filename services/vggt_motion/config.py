@@ -99,6 +99,10 @@ class FrontendConfig(Section):
     smoothing_lookahead_frames: int = Field(4, ge=0, description="frames after the present one that smoothing may see")
     selection: Literal["dense", "uniform", "covisibility", "parallax"] = "parallax"
     static_pruning: bool = True
+    disk_policy: Literal["wait", "thin"] = Field(
+        "wait",
+        description="files, while the ledger has no space: read no further, or let frames go by",
+    )
     parallax_px: float = Field(
         5.5, gt=0, description="tau_palx: shift since the last keyframe without its common part (frontend/keyframes.py)"
     )
@@ -129,6 +133,13 @@ class FrontendConfig(Section):
         if self.turn_max_keyframes < self.max_keyframes:
             raise ValueError("turn_max_keyframes must not be smaller than max_keyframes")
         return self
+
+
+class SpoolConfig(Section):
+    """Where the frontend of a live camera keeps what the ledger has not acknowledged yet."""
+
+    directory: Path | None = Field(None, description="folder; None = .vggt-motion/spool in the user's home")
+    max_bytes: int = Field(4 * 2**30, ge=0, description="when it is full, frames go by until there is room")
 
 
 class SfmConfig(Section):
@@ -243,7 +254,14 @@ class LoopsConfig(Section):
 class BackendConfig(Section):
     """Pose graph and map."""
 
-    huber_sigma: float = Field(1.345, gt=0, description="Huber width in standard deviations")
+    huber_sigma: float = Field(1.345, gt=0, description="Huber width in standard deviations of one dimension")
+    loop_loss: Literal["huber", "cauchy", "cauchy_gate"] = Field(
+        "cauchy_gate", description="how loops are kept from lying; cauchy_gate switches off those that disagree"
+    )
+    loop_cauchy_sigma: float = Field(
+        2.5, gt=0, description="Cauchy width in standard deviations of the residual's norm"
+    )
+    loop_gate_sigma: float = Field(5.5, gt=0, description="loops with a larger residual are switched off")
     solve_deadline_s: float = Field(120.0, gt=0)
     map_confidence: float = Field(0.5, ge=0, le=1, description="points below this confidence stay out of the map")
     map_voxel_over_step: float = Field(
@@ -295,6 +313,7 @@ class Config(BaseSettings):
 
     bus: BusConfig = BusConfig()
     ledger: LedgerConfig = LedgerConfig()
+    spool: SpoolConfig = SpoolConfig()
     frontend: FrontendConfig = FrontendConfig()
     inference: InferenceConfig = InferenceConfig()
     registration: RegistrationConfig = RegistrationConfig()

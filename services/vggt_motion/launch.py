@@ -36,6 +36,7 @@ _LOG_PATIENCE_S = 5.0  # what the frontend appended last is seen here after this
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
 LOG_FOLDER = "logs"
+SPOOL_FOLDER = "spool"
 _METHOD_SECTIONS = ("frontend", "inference", "registration", "loops", "backend")
 MIN_FRAMES = 2
 TOO_FEW_FRAMES = "the source has only one frame: a trajectory needs at least two"
@@ -178,6 +179,9 @@ class LocalRun:
         self.identity = session_identity(request, source)
         check_port(request.config.gateway.host, request.config.gateway.port)
         config = with_free_endpoint(request.config)
+        if config.spool.directory is None:
+            spool = config.spool.model_copy(update={"directory": request.out.absolute() / SPOOL_FOLDER})
+            config = config.model_copy(update={"spool": spool})
         self._request = replace(request, config=config)
         self._interrupts = 0
 

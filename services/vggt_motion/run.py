@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -93,6 +94,7 @@ def _claim_folder(request: launch.RunRequest, run: launch.LocalRun, *, fresh: bo
     try:
         if fresh:
             remove_session(ledger)
+            shutil.rmtree(request.out / launch.SPOOL_FOLDER, ignore_errors=True)
             for name in _FILES:
                 (request.out / name).unlink(missing_ok=True)
         state = prepare_session(ledger, run.identity)

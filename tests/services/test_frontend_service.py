@@ -18,7 +18,7 @@ import pytest
 
 from bus_processes import SESSION, connect, wait_until
 from vggt_motion.bus import codec
-from vggt_motion.bus.images import ReceivedImage, decode_image
+from vggt_motion.bus.images import ReceivedImage, decode_image, encode_image
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.bus.session import Bus, Sample
@@ -54,6 +54,7 @@ class Services:
             **os.environ,
             "VGGT_MOTION_BUS__ENDPOINT": self._endpoint,
             "VGGT_MOTION_BUS__SESSION": SESSION,
+            "VGGT_MOTION_SPOOL__DIRECTORY": str(self.folder / "spool"),
         }
         log = (self.folder / f"{name}.log").open("wb")
         command = [sys.executable, "-m", "vggt_motion", "serve", name, *arguments]
@@ -328,3 +329,41 @@ def test_a_restarted_live_camera_begins_a_new_epoch(services: Services, sequence
     epochs = {keyframe.epoch for keyframe in services.keyframes()}
     assert epochs == {0, 1}
     assert [event.event_id for event in services.events()] == ["session_started", "session_started/1"]
+
+
+def test_a_live_camera_loses_no_keyframe_while_the_ledger_is_down(services: Services, sequence: Path) -> None:
+    """Frames without numbers, as a bridge sends them: whoever does not take them in time loses them."""
+    frames = list(open_source(str(sequence)).frames())
+    ledger = services._children[0]
+    watch = ServiceWatch(services.bus)
+    child = services.frontend("zenoh:front")
+    assert watch.wait_for({"frontend": 1}, 20)
+    spooled = 0.0
+    with connect(services._endpoint) as camera:
+        publisher = camera.publisher(camera.keys.image("front"), blocking=False, history=8)
+        for number, frame in enumerate(frames):
+            if number == 5:
+                ledger.kill()
+                ledger.wait(10)
+            publisher.put(encode_image(frame, "front"))
+            time.sleep(0.1)
+            report = watch.wait_for_report("frontend", 5.0)
+            spooled = max(spooled, report.counters.get("spooled_records", 0.0) if report is not None else 0.0)
+        services.start("ledger", "--directory", str(services.folder / "ledger"))
+        wanted = [keyframe.image for keyframe in expected(sequence)[0]]
+
+        def stored() -> list[BlobRef]:
+            try:
+                return [keyframe.image for keyframe in services.keyframes()]
+            except BusError:
+                return []
+
+        # The last frames wait for the look-ahead.
+        wait_until(lambda: len(stored()) >= len(wanted) - 6, 60.0)
+        assert stored() == wanted[: len(stored())]
+        report = watch.wait_for_report("frontend", 5.0)
+    assert report is not None
+    assert spooled > 3 and report.counters["spool_full_waits"] == 0
+    assert not any(count for name, count in report.counters.items() if "dropped" in name)
+    child.terminate()
+    assert child.wait(10) == 0

@@ -73,13 +73,17 @@ class LedgerClient:
             DiskFullError: the ledger takes nothing until there is space again.
             CodecError: the record breaks a rule of the wire.
         """
-        payload = codec.encode(append_request(stream, record_id, record, blobs))
+        request = append_request(stream, record_id, record, blobs)
+        return self.append_encoded(codec.encode(request), patience_s=patience_s, what=record_id)
+
+    def append_encoded(self, payload: bytes, *, patience_s: float | None = None, what: str = "record") -> AppendResult:
+        """As :meth:`append`, of an :class:`.calls.AppendRequest` that was encoded before."""
         key = self._bus.keys.rpc("ledger", "append")
         reply = retry(
             self._bus,
             lambda: codec.decode(calls.AppendReply, self._bus.request(key, payload)),
             patience_s=patience_s,
-            what=f"append {record_id}",
+            what=f"append {what}",
         )
         return AppendResult(reply.sequence, reply.was_known)
 

@@ -20,11 +20,21 @@ import numpy.typing as npt
 from vggt_motion.bus import codec
 from vggt_motion.bus.images import ImageHeader, encode_image
 from vggt_motion.bus.jobs import one_line
+from vggt_motion.bus.ledger import append_request
 from vggt_motion.bus.pubsub import Publisher
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.config import Config
-from vggt_motion.errors import DiskFullError, InputError, RefusalCode, RequestRefusedError, SourceTruncatedError
+from vggt_motion.errors import (
+    BusUnavailableError,
+    DiskFullError,
+    InputError,
+    RefusalCode,
+    RequestRefusedError,
+    SourceTruncatedError,
+    VggtMotionError,
+)
 from vggt_motion.frontend.pipeline import FrontendPipeline, KeyframeOutput, Output
+from vggt_motion.frontend.spool import Spool
 from vggt_motion.records import BlobRef, Event, EventKind, MotionState, Stream
 from vggt_motion.sources.encoded import PNG
 from vggt_motion.sources.registry import is_on_bus, open_source
@@ -41,6 +51,7 @@ _IMAGE_ENCODING = "application/protobuf;foxglove.CompressedImage"
 _HISTORY_FRAMES = 64  # for a recorder that joins late or loses its link for a moment
 _REPORT_S = 0.2
 _DISK_RETRY_S = 1.0
+_SPOOL_POLL_S = 0.5
 
 
 def main(
@@ -121,6 +132,13 @@ class _Frontend:
                 history=_HISTORY_FRAMES,
                 encoding=_IMAGE_ENCODING,
             )
+        self._thinned_count = 0
+        self._thin_until_ns: int | None = None
+        self._newest_time_ns = 0
+        self._outbox: _Outbox | None = None
+        if source.is_live:
+            self._outbox = _Outbox(context, self._camera)
+            self._outbox.send_all()  # of a process before this one, and then the log says where it was
         self._epoch, first_segment = self._take_up() if source.is_live else (0, 0)
         self._pipeline = FrontendPipeline(
             context.config.frontend,
@@ -140,6 +158,8 @@ class _Frontend:
             for frame in self._source.frames():
                 if self._context.stopping.is_set():
                     return
+                if self._is_thinned(frame):
+                    continue
                 outputs = self._pipeline.push(frame)
                 self._publish(frame)
                 self._send(outputs)
@@ -150,6 +170,8 @@ class _Frontend:
             return  # a live source that we closed, not one that ended
         self._send(self._pipeline.finish())
         self._send_ended(truncation)
+        if self._outbox is not None:
+            self._outbox.send_all()
         self._report("ended", is_due=True)
         if truncation is not None:
             raise truncation
@@ -221,14 +243,30 @@ class _Frontend:
 
     def _append(self, stream: Stream, record_id: str, record: codec.Record, blobs: Sequence[bytes] = ()) -> None:
         """Append, waiting for ledger, link and space for as long as it takes; nothing is left out."""
+        if self._outbox is not None:
+            self._outbox.put(codec.encode(append_request(stream, record_id, record, blobs)))
+            return
+        since: float | None = None
         while True:
             try:
                 self._context.ledger.append(stream, record_id, record, blobs)
-                return
+                break
             except DiskFullError as error:
+                since = since or time.monotonic()
                 self._context.set_health("waiting", str(error))
                 if self._context.stopping.wait(_DISK_RETRY_S):
                     raise
+        if since is not None and self._context.config.frontend.disk_policy == "thin":
+            self._thin_until_ns = self._newest_time_ns + round(1e9 * (time.monotonic() - since))
+
+    def _is_thinned(self, frame: Frame) -> bool:
+        """Whether a frame of a file goes by, as a camera's would have while the ledger had no space."""
+        if self._thin_until_ns is not None and frame.capture_time_ns < self._thin_until_ns:
+            self._thinned_count += 1
+            return True
+        self._thin_until_ns = None
+        self._newest_time_ns = frame.capture_time_ns
+        return False
 
     def _report(self, state: str, *, is_due: bool = False) -> None:
         now = time.monotonic()
@@ -248,9 +286,70 @@ class _Frontend:
             turning_frames=pipeline.state_counts[MotionState.TURNING],
             linear_frames=pipeline.state_counts[MotionState.LINEAR],
             smoothing_delay_frames=delay,
+            thinned_frames=self._thinned_count,
+            **({} if self._outbox is None else self._outbox.counters()),
             **({} if rate_hz is None else {"smoothing_delay_s": delay / rate_hz}),
             **losses_of(self._source),
         )
+
+
+class _Outbox:
+    """Sends requests to the ledger in a thread of its own, through the spool."""
+
+    def __init__(self, context: ServiceContext, camera: str) -> None:
+        self._context = context
+        folder = context.config.spool.directory or Path.home() / ".vggt-motion" / "spool"
+        self._spool = Spool(folder / context.config.bus.session / camera, context.config.spool.max_bytes)
+        self._failure: VggtMotionError | None = None
+        self._full_count = 0
+        self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
+        self._thread.start()
+
+    def counters(self) -> dict[str, float]:
+        return {
+            "spooled_records": self._spool.count,
+            "spooled_bytes": self._spool.size_bytes,
+            "spool_full_waits": self._full_count,
+        }
+
+    def put(self, request: bytes) -> None:
+        """Returns when the request is on disk; a full spool holds up the source, whose frames go by meanwhile."""
+        is_full = False
+        while not self._spool.put(request, _SPOOL_POLL_S):
+            self._check()
+            if self._context.stopping.is_set():
+                raise BusUnavailableError("told to stop while the spool is full: the newest record is lost")
+            if not is_full:
+                is_full = True
+                self._full_count += 1
+                self._context.set_health("waiting", "the spool is full: frames go by", **self.counters())
+        self._check()
+
+    def send_all(self) -> None:
+        """Wait until everything is acknowledged; told to stop, leave the rest to the next frontend."""
+        while not self._spool.wait_until_empty(_SPOOL_POLL_S) and not self._context.stopping.is_set():
+            self._check()
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _run(self) -> None:
+        while not self._context.stopping.is_set():
+            request = self._spool.first(_SPOOL_POLL_S)
+            if request is None:
+                continue
+            try:
+                self._context.ledger.append_encoded(request, what="from the spool")
+                self._spool.drop_first()
+            except DiskFullError as error:
+                self._context.set_health("waiting", str(error), **self.counters())
+                self._context.stopping.wait(_DISK_RETRY_S)
+            except BusUnavailableError:
+                return  # told to stop
+            except VggtMotionError as error:
+                self._failure = error
+                return
 
 
 @contextlib.contextmanager

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import random
-import socket
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fault_run import SMALL_SUBMAPS, FaultRun, Outcome, Snapshot
+from fault_run import SMALL_SUBMAPS, FaultRun, Outcome, Snapshot, free_port
 
 SEED_VARIABLE = "VGGT_MOTION_FAULT_SEED"
 _TABLE = pytest.StashKey[dict[str, list[Outcome]]]()
@@ -85,12 +84,6 @@ def generator(request: pytest.FixtureRequest) -> random.Random:
     seed = f"{request.config.stash[_SEED]}/{request.node.name}"
     print(f"seed {seed}")
     return random.Random(seed)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="session")

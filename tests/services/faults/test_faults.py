@@ -3,20 +3,40 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import random
+import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import power_loss
 import pytest
 from cutting_proxy import CuttingProxy
-from fault_run import FaultRun, Outcome, moments
+from fault_run import FaultRun, Outcome, Snapshot, free_port, moments
 from test_fault_cross_section import SERVICES
 
-from conftest import free_port
-from vggt_motion.records import Stream
+from vggt_motion.bus import calls, codec
+from vggt_motion.bus.jobs import JobClient
+from vggt_motion.bus.ledger import LedgerClient, append_request
+from vggt_motion.bus.session import open_bus
+from vggt_motion.config import BusConfig
+from vggt_motion.errors import BusUnavailableError, RefusalCode, RequestRefusedError
+from vggt_motion.ledger.sqlite import read_only
+from vggt_motion.records import (
+    Constraint,
+    Job,
+    JobKind,
+    Keyframe,
+    Lease,
+    LogEntry,
+    Segment,
+    Stream,
+    SubmapGeometry,
+)
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(900)]
 Start = Callable[..., FaultRun]
@@ -46,10 +66,14 @@ def attack(run: FaultRun, faults: list[Callable[[], object]], generator: random.
 @pytest.mark.parametrize("number", range(KILL_ROUNDS))
 def test_sigkill_at_random_moments(number: int, start: Start, judge: Judge, generator: random.Random) -> None:
     """Each service at least ten times over all rounds; never so often that supervision has to give up."""
-    run = fully_started(start(*TWO_OF_EACH, seconds_per_submap=3.0))
+    run = start(*TWO_OF_EACH, seconds_per_submap=3.0)
     per_service = -(-KILLS // KILL_ROUNDS)
+    for _ in range(per_service):  # while there is input: it is short
+        assert run.wait_until(lambda: run.processes("frontend"))
+        run.wait_until(lambda: False, generator.uniform(0.0, 2.5))
+        run.kill("frontend")
     faults: list[Callable[[], object]] = []
-    for service in SERVICES:
+    for service in sorted(set(SERVICES) - {"frontend"}):
         faults += [lambda s=service: run.kill(s, generator.randrange(2)) for _ in range(per_service)]
     attack(run, faults, generator, over_s=25.0)
     judge("SIGKILL at random moments", run.finish())
@@ -67,9 +91,12 @@ def test_sigstop_for_longer_than_the_lease(number: int, start: Start, judge: Jud
 
 @pytest.mark.parametrize("number", range(3))
 def test_restart(number: int, start: Start, judge: Judge, generator: random.Random) -> None:
-    run = fully_started(start(*TWO_OF_EACH, seconds_per_submap=3.0))
+    run = start(*TWO_OF_EACH, seconds_per_submap=3.0)
+    assert run.wait_until(lambda: run.processes("frontend"))
+    run.wait_until(lambda: False, generator.uniform(0.0, 2.0))
+    run.restart("frontend")
     faults: list[Callable[[], object]] = []
-    for service in SERVICES:
+    for service in sorted(set(SERVICES) - {"frontend"}):
         faults += [lambda s=service: run.restart(s, generator.randrange(2)) for _ in range(2)]
     attack(run, faults, generator, over_s=20.0)
     judge("restart (SIGTERM)", run.finish())
@@ -140,12 +167,12 @@ def test_kill_of_everything_and_resume(
     number: int, start: Start, judge: Judge, generator: random.Random, tmp_path: Path
 ) -> None:
     out = tmp_path / "resumed"
-    first = start(seconds_per_submap=2.0, out=out)
+    first = start(seconds_per_submap=1.0, out=out)
     wanted = generator.choice([Stream.KEYFRAME, Stream.SUBMAP, Stream.CONSTRAINT])
     first.wait_until(lambda: first.count(wanted) > generator.randrange(4))
     first.wait_until(lambda: False, generator.uniform(0.0, 1.5))
     first.kill_everything()
-    second = start(seconds_per_submap=0.2, out=out)
+    second = start(seconds_per_submap=1.0, out=out)
     second.injected.update(first.injected)
     second.witness.acknowledged.extend(first.witness.acknowledged)
     judge("SIGKILL of everything, resumed", second.finish())
@@ -207,3 +234,175 @@ def test_the_disk_fills_up(reserve_mb: int, start: Start, judge: Judge, small_di
         run.wait_until(lambda: False, 1.0)
     judge("ledger's disk full", run.finish())
     assert run.injected["ledger's disk full"] >= 2
+
+
+@pytest.mark.skipif(not power_loss.is_available(), reason="strace is not installed: what was synced cannot be known")
+@pytest.mark.parametrize("number", range(3))
+def test_power_loss_and_resume_from_the_crash_image(
+    number: int, start: Start, judge: Judge, generator: random.Random, tmp_path: Path
+) -> None:
+    first = start(seconds_per_submap=1.0)
+    assert first.wait_until(lambda: first.processes("ledger"))
+    trace = power_loss.Trace(first.processes("ledger")[0], tmp_path / "strace.txt")
+    wanted = [Stream.KEYFRAME, Stream.SUBMAP, Stream.CONSTRAINT][number]
+    first.wait_until(lambda: first.count(wanted) > generator.randrange(1, 4))
+    first.wait_until(lambda: False, generator.uniform(0.0, 0.5))
+    first.kill_everything()
+    trace.end()
+    unsafe = trace.unsafe(first.out / "ledger")
+    assert unsafe.sync_count > 10, "the trace saw nothing"
+    image = tmp_path / "image"
+    shutil.copytree(first.out, image, ignore=shutil.ignore_patterns("ledger"))
+    lost = power_loss.crash_image(first.out / "ledger", image / "ledger", unsafe, generator)
+    print(f"{unsafe.sync_count} syncs, {unsafe.count} unsafe, of these: {lost}")
+    second = start(seconds_per_submap=1.0, out=image)
+    second.injected["power loss"] += 1
+    second.witness.acknowledged.extend(first.witness.acknowledged)
+    judge("power loss, resumed", second.finish())
+
+
+class Rogue:
+    """A client of the fabric that sends again, late, in another order, and what it should not."""
+
+    def __init__(self, run: FaultRun, generator: random.Random) -> None:
+        self._run, self._generator = run, generator
+        self._bus = open_bus(BusConfig(endpoint=run.endpoint, connect_timeout_s=60.0, request_timeout_s=5.0))
+        self._ledger, self._jobs = LedgerClient(self._bus), JobClient(self._bus)
+
+    def close(self) -> None:
+        self._bus.close()
+
+    def _count(self, what: str, number: int = 1) -> None:
+        self._run.injected[what] += number
+
+    def _all(self, stream: Stream) -> list[LogEntry]:
+        entries: list[LogEntry] = []
+        while page := self._ledger.read(stream, len(entries), patience_s=5.0):
+            entries += page
+        return entries
+
+    def append_again(self) -> None:
+        """Records of the frontend once more, in any order: acknowledged again, under their old numbers."""
+        for stream, cls in ((Stream.KEYFRAME, Keyframe), (Stream.SEGMENT, Segment)):
+            entries = self._all(stream)
+            self._generator.shuffle(entries)
+            for entry in entries[:10]:
+                result = self._ledger.append(stream, entry.record_id, codec.decode(cls, entry.payload), patience_s=5.0)
+                assert (result.sequence, result.was_known) == (entry.sequence, True)
+                self._count("record appended again")
+
+    def append_other(self) -> None:
+        """Another content under a known id."""
+        for entry in self._all(Stream.KEYFRAME)[:5]:
+            other = replace(codec.decode(Keyframe, entry.payload), capture_time_ns=1)
+            with pytest.raises(RequestRefusedError) as caught:
+                self._ledger.append(Stream.KEYFRAME, entry.record_id, other, patience_s=5.0)
+            assert caught.value.code is RefusalCode.CONFLICT
+            self._count("other content under a known id")
+
+    def publish_again(self) -> None:
+        """What the ledger has published on the log, again, backwards, and twice; and what is no record at all."""
+        for stream in (Stream.KEYFRAME, Stream.SEGMENT, Stream.SUBMAP, Stream.CONSTRAINT):
+            publisher = self._bus.publisher(self._bus.keys.log(stream.value), blocking=True)
+            entries = self._all(stream)
+            for entry in [*reversed(entries), *entries]:
+                publisher.put(codec.encode(entry))
+            for size in (0, 1, 100):
+                publisher.put(self._generator.randbytes(size))
+            self._count("message again or out of order", 2 * len(entries) + 3)
+            publisher.close()
+
+    def misuse_a_lease(self) -> None:
+        """Garbage, then the result of another job, then nothing more: the lease runs out."""
+        for kind, stream in ((JobKind.PREDICT, Stream.SUBMAP), (JobKind.REGISTER, Stream.CONSTRAINT)):
+            lease = self._jobs.claim([kind], ["recorded"], "rogue/1", 0.5)
+            if lease is None:
+                continue
+            key = self._bus.keys.rpc("jobs", "done")
+            for garbage in (b"", self._generator.randbytes(300)):
+                with pytest.raises(RequestRefusedError):
+                    self._bus.request(key, garbage)
+                self._count("garbage in place of a result")
+            others = [entry for entry in self._all(stream) if entry.record_id != lease.job.job_id]
+            if others:
+                cls = SubmapGeometry if stream is Stream.SUBMAP else Constraint
+                other = codec.decode(cls, others[0].payload)
+                with pytest.raises(RequestRefusedError):
+                    self._jobs.done(lease, stream, other.record_id, other)
+                self._count("result of another job")
+                with pytest.raises(RequestRefusedError):
+                    self._bus.request(key, codec.encode(_done_as(lease, stream, other)))
+                self._count("result of another job")
+
+    def hand_in_again(self) -> None:
+        """The result of a job that is done, under a lease that is none."""
+        for entry in self._all(Stream.CONSTRAINT)[:3]:
+            record = codec.decode(Constraint, entry.payload)
+            job = Job(entry.record_id, JobKind.REGISTER, b"", "RegisterTask")
+            with contextlib.suppress(RequestRefusedError):
+                self._jobs.done(Lease(job, "no-such-lease", 1, 1.0), Stream.CONSTRAINT, record.record_id, record)
+            self._count("result again, under no lease")
+
+
+def _done_as(lease: Lease, stream: Stream, other: SubmapGeometry | Constraint) -> calls.DoneRequest:
+    request = append_request(stream, other.record_id, other, ())
+    return calls.DoneRequest(lease.job.job_id, lease.lease_id, replace(request, record_id=lease.job.job_id))
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_duplicate_late_reordered_and_foreign_messages(
+    number: int, start: Start, judge: Judge, generator: random.Random
+) -> None:
+    run = fully_started(start(*TWO_OF_EACH, seconds_per_submap=2.0))
+    rogue = Rogue(run, generator)
+    try:
+        tricks = [
+            rogue.append_again,
+            rogue.append_other,
+            rogue.publish_again,
+            rogue.misuse_a_lease,
+            rogue.hand_in_again,
+        ]
+        for _ in range(3):
+            generator.shuffle(tricks)
+            for trick in tricks:
+                if run.is_running:
+                    trick()
+    except BusUnavailableError:
+        assert not run.wait_until(lambda: False, 5.0), "a trick was not answered"
+    finally:
+        rogue.close()
+    judge("duplicate, late, foreign", run.finish())
+
+
+def test_late_results_of_frozen_workers(start: Start, judge: Judge, generator: random.Random) -> None:
+    """Both workers are frozen with a job in hand until their leases are lost, and hand in what they had."""
+    run = fully_started(start(*TWO_OF_EACH, seconds_per_submap=2.0))
+    for _ in range(3):
+        run.wait_until(lambda: False, generator.uniform(0.5, 2.5))
+        run.freeze("inference", FREEZE_S, 0)
+        run.freeze("registration", FREEZE_S, 1)
+    judge("late results", run.finish())
+
+
+def test_a_poison_submap_is_halved(start: Start, fault_sample: Path, small_reference: tuple[Path, Snapshot]) -> None:
+    """The whole run, but the depth of one submap is gone from the recording: given up, halved, and the graph breaks."""
+    folder, reference = small_reference
+    with read_only(folder / "ledger" / "ledger.db") as reader:
+        rows = reader.records(Stream.SUBMAP.value, 0, 100)
+    victim = next(g for row in rows if (g := codec.decode(SubmapGeometry, row.payload)).spec.submap_index == 6)
+    copy = folder.parent / "poisoned"
+    shutil.copytree(folder / "ledger", copy)
+    for frame in victim.frames:
+        for path in (copy / "blobs").rglob(frame.depth.sha256):
+            path.write_bytes(b"poison")
+    run = start(f"inference.recorded.ledger={copy}", "ledger.retry_backoff_s=0.05", seconds_per_submap=0.0)
+    outcome = run.finish()
+    assert outcome.exit_code == 0, outcome.output
+    got = Snapshot.of(run.out)
+    metrics = json.loads((run.out / "metrics.json").read_text(encoding="utf-8"))
+    assert (got.keyframes, got.segments) == (reference.keyframes, reference.segments)
+    assert {"submap/000006/r1"} <= reference.submaps - got.submaps
+    assert metrics["dead_job_count"] == 3 and metrics["break_count"] >= 1
+    warnings = "\n".join(metrics["warnings"])
+    assert "damaged" in warnings and "submap/000006a/r1" in warnings and "the trajectory is broken" in warnings
