@@ -44,13 +44,15 @@ class CameraPrior:
     def starts(self) -> Iterator[tuple[float, bool]]:
         """Focal lengths over width to grow from, best first, and whether each is a usual one."""
         known = self.focal_over_width
+        usual = [start for start in _UNKNOWN_STARTS if start <= _LAST_USUAL_START]
         if known is not None:
             yield known, True
+            # a wrong hint is contradicted best from afar
+            usual.sort(key=lambda start: -abs(math.log(start / known)))
         if self.is_fixed:
             return
-        for start in sorted(_UNKNOWN_STARTS, key=lambda start: -abs(math.log(start / (known or start)))):
-            if start <= _LAST_USUAL_START:
-                yield start, True
+        for rank, start in enumerate(usual):
+            yield start, known is None or rank == 0
         yield from ((start, False) for start in _UNKNOWN_STARTS if start > _LAST_USUAL_START)
 
     def calibration(self, width_px: int, is_unrectified: bool = False) -> Calibration:

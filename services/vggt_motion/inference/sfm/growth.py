@@ -74,7 +74,7 @@ def grow(observations: Observations, frame_count: int, camera: Scene, calibratio
         growing = placed
         count = int(growing.registered.sum())
         if count % 3 == 0 or growing.registered.all():
-            growing = settle(growing, observations, calibration, iterations=5, robust_px=2.0)
+            growing = settle(growing, observations, calibration, iterations=5, robust_px=1.0)
     return growing
 
 

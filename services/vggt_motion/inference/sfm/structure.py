@@ -25,9 +25,11 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 _REGROW_RELATIVE = 0.05  # a focal length that moved so far is grown from once more
-_GOOD_EXPLAINED = 0.75  # share of observations that fit: no further start is tried
+_GOOD_EXPLAINED = 0.75  # share of observations that fit, and
+_GOOD_REPROJECTION_PX = 0.5  # how well, with which no further start is tried
+_MAX_K1 = 0.6  # beyond it a coefficient describes the scene, not a lens
 _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong distortion is believed
-_CAPPED_PX = 20.0
+_CAPPED_PX = 1.5  # an observation that misses by more belongs to something else, however far it misses
 _MIN_FRAME_OBSERVATIONS = 15
 # kernel px, gate px, iterations, tolerance
 _STAGES = ((2.0, 12.0, 15, 1e-4), (1.0, 5.0, 20, 1e-4), (0.5, 2.5, 25, 1e-5))
@@ -80,12 +82,12 @@ def solve(
     best: Structure | None = None
     attempts = []
     for start, is_usual in prior.starts():
-        if best is not None and best.explained > _GOOD_EXPLAINED and (prior.is_sure or not is_usual):
+        if best is not None and _is_convincing(best) and (prior.is_sure or not is_usual):
             break
         solved = _from_start(observations, positions, width_px, prior, calibration, start)
         attempts.append(f"grown from focal {start:.2f} widths: {_outcome(solved, width_px)}")
         best = _better(best, solved)
-        if solved is None or solved is not best or not _is_worth_regrowing(solved, start, width_px, prior):
+        if solved is None or not _is_worth_regrowing(solved, start, width_px, prior):
             continue
         moved = solved.scene.focal_px / width_px
         again = _from_start(observations, positions, width_px, prior, calibration, moved)
@@ -96,7 +98,11 @@ def solve(
     if not prior.is_fixed and best.registered.sum() > 2:
         wide = prior.calibration(width_px, is_unrectified=True)
         distorted = _adjusted(observations, best.registered, positions, best.scene, wide)
-        if distorted is not None and distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost:
+        if (
+            distorted is not None
+            and abs(distorted.scene.radial_k1) < _MAX_K1
+            and distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost
+        ):
             attempts.append(f"with strong distortion: {_outcome(distorted, width_px)}")
             best, calibration = distorted, wide
     polished = _polished(best, observations, [working.grey[p] for p in positions], working.usable, calibration)
@@ -155,6 +161,11 @@ def _polished(
         weakest_share=solved.weakest_share,
         weakest_link=solved.weakest_link,
     )
+
+
+def _is_convincing(solved: Structure) -> bool:
+    """Whether no further start is worth its time."""
+    return solved.explained > _GOOD_EXPLAINED and solved.reprojection_px < _GOOD_REPROJECTION_PX
 
 
 def _is_worth_regrowing(solved: Structure, start: float, width_px: int, prior: CameraPrior) -> bool:
@@ -244,7 +255,7 @@ def _described(
         reprojection_px=float(residuals.mean()),
         median_parallax_deg=_median_parallax_deg(scene, fitting),
         focal_relative_sigma=focal.relative_sigma(information, calibration),
-        cost=float(np.log1p(np.minimum(everything, _CAPPED_PX) ** 2).sum()),
+        cost=float((np.minimum(everything, _CAPPED_PX) ** 2).sum()),
         weakest_share=weakest_share,
         weakest_link=weakest_link,
     )
