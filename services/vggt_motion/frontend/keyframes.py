@@ -7,6 +7,7 @@ ends.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vggt_motion.config import FrontendConfig
-from vggt_motion.frontend.flow import CellGrid, Flow, Grey, at_width
+from vggt_motion.frontend.flow import CellGrid, Flow, Grey, at_width, median
 from vggt_motion.records import DropReason, MotionState
 from vggt_motion.sources.source import Frame
 
@@ -134,9 +135,9 @@ class ParallaxTracker:
         if len(self._positions) == 0:
             return self._reached_px
         displacement = self._positions - self._seeds
-        common = np.median(displacement, axis=0)
-        spread = np.median(np.hypot(*(displacement - common).T))
-        return self._reached_px + max(float(spread), ROTATION_WEIGHT * float(np.hypot(*common)))
+        common_x, common_y = median(displacement[:, 0]), median(displacement[:, 1])
+        spread = median(np.hypot(displacement[:, 0] - common_x, displacement[:, 1] - common_y))
+        return self._reached_px + max(spread, ROTATION_WEIGHT * math.hypot(common_x, common_y))
 
     @property
     def covisible_share(self) -> float:
@@ -243,9 +244,12 @@ class KeyframeSelector:
 
     def push(self, candidate: Candidate) -> Iterator[Selected]:
         """Take the next frame; yields verdicts on it or on the frame before."""
-        if candidate.flow_cells is not None:
+        is_standing = self._static_pruning and candidate.state is MotionState.STATIC
+        is_inside_stop = is_standing and self._stop_first is not None
+        # inside a stop there is nothing to measure: its last frame is where the next stretch begins
+        if candidate.flow_cells is not None and not is_inside_stop:
             self._tracker.advance(candidate.flow_cells, candidate.usable, candidate.fixed)
-        if self._static_pruning and candidate.state is MotionState.STATIC:
+        if is_standing:
             yield from self._push_standing(candidate)
         else:
             yield from self._push_moving(candidate)

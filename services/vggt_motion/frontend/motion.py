@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.frontend.flow import Flow
+from vggt_motion.frontend.flow import Flow, median
 from vggt_motion.records import MotionState
 
 RATE_INTERVAL_S = (
@@ -21,7 +21,8 @@ RATE_INTERVAL_S = (
 )
 
 _MIN_TEXTURED_SHARE = 0.02
-_AMBIGUOUS_RATIO = 0.2  # with fewer static cells no noise is as strong: something moves
+# Static ratios that noise can have changed so much that it matters; below, no noise is as strong: something moves.
+_AMBIGUOUS_RATIOS = (0.2, 0.97)
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,13 @@ def measure_flow(
     middle = slice(columns // 4, columns - columns // 4)
     is_static = is_quasi_static(flow_cells, static_flow_px)
     static_ratio = float(np.mean(is_static[believed]))
-    if prove_motion is not None and _AMBIGUOUS_RATIO < static_ratio < 1.0:
+    if prove_motion is not None and _AMBIGUOUS_RATIOS[0] < static_ratio < _AMBIGUOUS_RATIOS[1]:
         votes = believed & (is_static | prove_motion())
         static_ratio = float(np.mean(is_static[votes]))
     return FlowMeasures(
         static_ratio=static_ratio,
         lateral_px=float(np.mean(np.abs(f_x))),
-        yaw_px=float(np.median(f_x[:, middle][_or_all(textured[:, middle])])),
+        yaw_px=median(f_x[:, middle][_or_all(textured[:, middle])]),
         interval_s=interval_s,
         is_repeat=is_repeat,
     )
