@@ -223,7 +223,7 @@ def test_ego_mask_is_kept_out_and_handed_on(drive: list[Frame]) -> None:
     rng = np.random.default_rng(5)
     scene = cv2.imdecode(np.frombuffer(drive[0].encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert scene is not None
-    wheel = cv2.GaussianBlur(rng.standard_normal((180, 2000)), (0, 0))
+    wheel = cv2.GaussianBlur(rng.standard_normal((180, 2000)), (0, 0), 2.0)
     wheel = np.clip(120 + 40 * wheel / wheel.std(), 0, 255).astype(np.uint8)
     frames = []
     for k in range(20):
