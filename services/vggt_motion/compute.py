@@ -88,7 +88,8 @@ class ComputeChild:
             function: importable by name; it and its arguments cross a pipe between our own two processes.
             args: positional arguments.
             deadline_s: seconds of wall clock that the call may take.
-            on_tick: called about twenty times a second from the calling thread; returning False cancels.
+            on_tick: called about twenty times a second from the calling thread; returning False cancels, and so does
+                an exception, which is passed on.
 
         Raises:
             ComputeCancelledError: ``on_tick`` returned False.
@@ -101,7 +102,7 @@ class ComputeChild:
         try:
             connection.send((function, args))
             while not connection.poll(_POLL_S):
-                if on_tick is not None and not on_tick():
+                if on_tick is not None and not self._tick(on_tick):
                     self.kill()
                     raise ComputeCancelledError("cancelled")
                 if time.monotonic() > end:
@@ -115,6 +116,14 @@ class ComputeChild:
             raise ComputeError(outcome.message, outcome.traceback_text)
         result: Result = outcome
         return result
+
+    def _tick(self, on_tick: Callable[[], bool]) -> bool:
+        try:
+            return on_tick()
+        except BaseException:
+            # The call is given up: its result, left in the pipe, would be taken for that of the next one.
+            self.kill()
+            raise
 
     def _reap(self) -> int | None:
         process = self._process

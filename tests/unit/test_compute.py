@@ -86,3 +86,18 @@ def test_the_child_dies_with_a_killed_parent() -> None:
     else:
         os.kill(pid, signal.SIGKILL)
         pytest.fail("the computing process outlived its parent")
+
+
+def _late(value: int) -> int:
+    time.sleep(0.3)
+    return value
+
+
+def test_a_call_that_is_given_up_by_an_exception_leaves_no_result_for_the_next(child: ComputeChild) -> None:
+    def fail() -> bool:
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        child.call(_late, 1, deadline_s=30, on_tick=fail)
+    time.sleep(0.5)
+    assert child.call(_late, 2, deadline_s=30) == 2

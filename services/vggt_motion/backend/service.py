@@ -15,11 +15,12 @@ from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.compute import ComputeCancelledError, ComputeChild
 from vggt_motion.config import Config
-from vggt_motion.errors import BusUnavailableError, RequestRefusedError, VggtMotionError
+from vggt_motion.errors import BusUnavailableError, DiskFullError, RequestRefusedError, VggtMotionError
 from vggt_motion.records import Constraint, GraphUpdate, Job, JobKind, Stream
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.05
+_RETRY_S = 0.5
 _MAX_SOLVE_FAILURES = 3
 
 
@@ -37,6 +38,7 @@ class _Backend:
         self._child = ComputeChild("backend")
         self._submitted: set[str] = set()
         self._has_unsubmitted = False
+        self._retry_at = 0.0
         self._solved_inputs = -1  # how many submaps and constraints the newest graph was solved from
         self._solve_failures = 0
 
@@ -56,7 +58,7 @@ class _Backend:
         records = self._log.poll()
         for record in records:
             self._state.apply(record)
-        if records or self._has_unsubmitted:
+        if records or (self._has_unsubmitted and time.monotonic() >= self._retry_at):
             self._submit()
             self._report()
         return bool(records)
@@ -80,8 +82,8 @@ class _Backend:
         ]
         try:
             self._context.jobs.submit(jobs)
-        except BusUnavailableError as error:
-            _log.warning("jobs not submitted yet", extra={"reason": str(error)})
+        except (BusUnavailableError, DiskFullError) as error:
+            self._hold_up(f"jobs not submitted yet: {error}")
             return
         self._submitted.update(job.job_id for job in planned)
         self._has_unsubmitted = False
@@ -135,13 +137,29 @@ class _Backend:
         self._solve_failures = 0
         self._solved_inputs = inputs
         try:
-            self._context.ledger.append(Stream.GRAPH, update.record_id, update)
+            self._append(update)
         except RequestRefusedError as error:
             if is_final:
                 raise
             # A backend before this one had seen as many records, but not the same ones: its graph stands for now.
             _log.info("live graph not kept", extra={"reason": str(error)})
         return True
+
+    def _append(self, update: GraphUpdate) -> None:
+        while True:
+            try:
+                self._context.ledger.append(Stream.GRAPH, update.record_id, update)
+                return
+            except DiskFullError as error:
+                self._hold_up(f"graph not appended yet: {error}")
+            if self._context.stopping.wait(_RETRY_S):
+                return
+
+    def _hold_up(self, reason: str) -> None:
+        """Say why it does not go on, and wait a moment with the next attempt."""
+        _log.warning("waiting", extra={"reason": reason})
+        self._context.set_health("waiting", reason)
+        self._retry_at = time.monotonic() + _RETRY_S
 
     def _keep_up(self) -> bool:
         if self._context.stopping.is_set():

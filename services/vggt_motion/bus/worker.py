@@ -12,7 +12,7 @@ from typing import Any
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.service import ServiceContext
 from vggt_motion.compute import ComputeCancelledError, ComputeChild, ComputeError
-from vggt_motion.errors import BusUnavailableError, InputError, VggtMotionError
+from vggt_motion.errors import BusUnavailableError, DiskFullError, InputError, VggtMotionError
 from vggt_motion.records import BlobRef, JobKind, Lease, Stream
 
 _log = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ def work(
             context.set_health("idle", "", jobs_done=done, jobs_failed=failed)
             try:
                 lease = context.jobs.claim(kinds, models, context.worker, _CLAIM_WAIT_S)
-            except BusUnavailableError as error:
+            except (BusUnavailableError, DiskFullError) as error:
                 context.set_health("waiting", str(error), jobs_done=done, jobs_failed=failed)
                 context.stopping.wait(_RETRY_S)
                 continue
@@ -130,7 +130,7 @@ def _carry_out(
         record, blobs = child.call(
             computation.function, *computation.arguments, deadline_s=deadline_s, on_tick=keeper.tick
         )
-        is_committed = context.jobs.done(lease, stream, record.record_id, record, blobs)
+        is_committed = _hand_in(context, keeper, stream, record, blobs)
     except ComputeCancelledError:
         if context.stopping.is_set():
             raise
@@ -152,11 +152,26 @@ def _carry_out(
     return True
 
 
+def _hand_in(
+    context: ServiceContext, keeper: _LeaseKeeper, stream: Stream, record: Any, blobs: Sequence[bytes]
+) -> bool:
+    """Hand in a result; while the ledger has no space, wait with it: it was dear, and the job has not failed."""
+    while True:
+        try:
+            return context.jobs.done(keeper.lease, stream, record.record_id, record, blobs)
+        except DiskFullError as error:
+            context.set_health("waiting", str(error))
+        # Also without the lease: a late result is taken once.
+        keeper.tick()
+        if context.stopping.wait(_RETRY_S):
+            raise ComputeCancelledError("told to stop")
+
+
 class _LeaseKeeper:
     """Sends heartbeats from the worker's own loop: a worker that hangs loses its lease, one that computes does not."""
 
     def __init__(self, context: ServiceContext, lease: Lease) -> None:
-        self._context, self._lease = context, lease
+        self._context, self.lease = context, lease
         self._interval_s = lease.duration_s / _HEARTBEATS_PER_LEASE
         self._next = time.monotonic() + self._interval_s
 
@@ -168,6 +183,6 @@ class _LeaseKeeper:
             return True
         self._next = time.monotonic() + self._interval_s
         try:
-            return self._context.jobs.heartbeat(self._lease.lease_id)
-        except BusUnavailableError:
-            return True  # the link may come back before the result is there, and a late result is still worth something
+            return self._context.jobs.heartbeat(self.lease.lease_id)
+        except (BusUnavailableError, DiskFullError):
+            return True  # that may be over before the result is there, and a late result is still worth something
