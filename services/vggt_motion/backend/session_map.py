@@ -1,19 +1,60 @@
-"""From the log to the map: the keyframes of the solved submaps with their payloads, one at a time."""
+"""The map of one moment of a session: records and payloads of the log brought to ``backend/map.py``."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 
 import cv2
 import numpy as np
 
-from vggt_motion.backend.map import MapFrame
+from vggt_motion.backend.map import MapFrame, PointMap, build_map
+from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory
 from vggt_motion.bus.depth import decode_depth
+from vggt_motion.config import BackendConfig
 from vggt_motion.errors import CodecError
 from vggt_motion.records import BlobRef, GraphUpdate, Keyframe, SubmapGeometry
 
 
-def map_frames(
+def main_component(trajectory: Trajectory) -> int:
+    """The connected part with the most frames, the first of equals; NO_COMPONENT without a pose.
+
+    Parts behind a break share no frame of reference: one map cannot hold two of them.
+    """
+    counts = Counter(frame.component for frame in trajectory.frames if frame.component != NO_COMPONENT)
+    return min(counts, key=lambda component: (-counts[component], component), default=NO_COMPONENT)
+
+
+def build_session_map(
+    keyframes: Mapping[str, Keyframe],
+    submaps: Mapping[int, SubmapGeometry],
+    graph: GraphUpdate,
+    trajectory: Trajectory,
+    config: BackendConfig,
+    read_blob: Callable[[BlobRef], bytes],
+) -> PointMap:
+    """Gather the map of the largest connected part.
+
+    Args:
+        keyframes: by id; their images give the colours.
+        submaps: geometry by submap index, in the revisions that the graph holds; others are not used.
+        graph: poses of the submaps.
+        trajectory: composed from the same graph; gives scale and spacing of the keyframes.
+        config: confidence threshold, voxels, greatest number of points.
+        read_blob: fetches a payload; its errors pass through.
+
+    Raises:
+        CodecError: an image or a depth payload cannot be decoded.
+    """
+    component = main_component(trajectory)
+    steps = np.linalg.norm(np.diff(trajectory.track("key", component).positions, axis=0), axis=1)
+    moving = steps[steps > 0.0]
+    step = float(np.median(moving)) if len(moving) else 0.0
+    frames = _map_frames(keyframes, submaps, graph, component, read_blob)
+    return build_map(frames, config, step=step, scale=trajectory.scale)
+
+
+def _map_frames(
     keyframes: Mapping[str, Keyframe],
     submaps: Mapping[int, SubmapGeometry],
     graph: GraphUpdate,
