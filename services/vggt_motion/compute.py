@@ -99,23 +99,26 @@ class ComputeChild:
         """
         connection = self.start()
         end = time.monotonic() + deadline_s
-        try:
-            connection.send((function, args))
-            while not connection.poll(_POLL_S):
-                if on_tick is not None and not self._tick(on_tick):
-                    self.kill()
-                    raise ComputeCancelledError("cancelled")
-                if time.monotonic() > end:
-                    self.kill()
-                    raise ComputeDeadlineError(f"took longer than {deadline_s:g} s and was ended")
-            outcome = connection.recv()
-        except (EOFError, OSError) as error:
-            exit_code = self._reap()
-            raise ComputeCrashedError(f"the computing process died ({_describe(exit_code)})") from error
+        self._guarded(lambda: connection.send((function, args)))
+        while not self._guarded(lambda: connection.poll(_POLL_S)):
+            if on_tick is not None and not self._tick(on_tick):
+                self.kill()
+                raise ComputeCancelledError("cancelled")
+            if time.monotonic() > end:
+                self.kill()
+                raise ComputeDeadlineError(f"took longer than {deadline_s:g} s and was ended")
+        outcome: Any = self._guarded(connection.recv)
         if isinstance(outcome, _Failure):
             raise ComputeError(outcome.message, outcome.traceback_text)
         result: Result = outcome
         return result
+
+    def _guarded(self, step: Callable[[], Result]) -> Result:
+        try:
+            return step()
+        except (EOFError, OSError) as error:
+            exit_code = self._reap()
+            raise ComputeCrashedError(f"the computing process died ({_describe(exit_code)})") from error
 
     def _tick(self, on_tick: Callable[[], bool]) -> bool:
         try:
