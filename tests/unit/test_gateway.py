@@ -146,7 +146,7 @@ def test_a_broken_trajectory_is_visible_and_can_be_had_in_parts(session: Session
         missing = client.get("/api/v1/trajectory?component=1")
         assert (missing.status_code, missing.json()) == (
             404,
-            {"error": "the trajectory has no component 1: there are 0, 2"},
+            {"error": "the trajectory has no component 1: its components are 0, 2"},
         )
         status = client.get("/api/v1/status").json()
         assert status["graph"]["components"] == 2
@@ -287,7 +287,7 @@ def test_status_counts_what_was_fed(client: TestClient, session: Session, state:
     assert status["submaps"]["doubtful"] == ["submap 1 (revision 1): low_quality: few tracks"]
     assert status["constraints"] == {"accepted": 3, "refused": 0, "loops_accepted": 0}
     assert status["graph"]["edges_used"] == 3
-    assert status["predictor"] == {"configured": "sfm", "models": {"sfm": 4}}
+    assert status["predictor"] == {"configured": "sfm", "reason": "", "models": {"sfm": 4}}
     positions = {s["stream"]: (s["ledger_position"], s["gateway_position"]) for s in status["streams"]}
     assert positions["keyframe"] == (4 * BASE, 4 * BASE)
     assert positions["descriptor"] == (0, 0)
@@ -364,6 +364,10 @@ def test_openapi_describes_every_route_with_examples(client: TestClient) -> None
     content = spec["paths"]["/api/v1/trajectory"]["get"]["responses"]["200"]["content"]
     assert all("example" in entry for entry in content.values())
     assert content.keys() == {"application/json", "text/plain", "text/csv"}
+    parameters = spec["paths"]["/api/v1/trajectory"]["get"]["parameters"]
+    assert all(entry.get("example") is not None or entry["schema"].get("examples") for entry in parameters)
+    for path in spec["paths"].values():
+        assert "422" not in path["get"]["responses"], "a wrong parameter is answered with 400"
     assert "example" in spec["paths"]["/api/v1/events"]["get"]["responses"]["200"]["content"]["text/event-stream"]
     assert spec["components"]["schemas"]["ServiceStatus"]["properties"]["service"]["examples"] == ["inference"]
 

@@ -71,10 +71,25 @@ def create_app(
     app.state.results = Results(state, build_map or (lambda snapshot: map_as_ply(snapshot, state)))
     for module in (health, status, results, events, metrics, viewer):
         app.include_router(module.router)
+    _leave_out_unused_answers(app)
     _add_error_handlers(app)
     app.add_middleware(AccessControl, config=config)
     app.add_middleware(RequestCount, metrics=app.state.metrics)
     return app
+
+
+def _leave_out_unused_answers(app: FastAPI) -> None:
+    """FastAPI declares 422 for every route with parameters; here a wrong one is answered with 400."""
+    described = app.openapi
+
+    def describe() -> dict[str, Any]:
+        spec = described()
+        for path in spec["paths"].values():
+            for operation in path.values():
+                operation["responses"].pop("422", None)
+        return spec
+
+    app.openapi = describe  # type: ignore[method-assign]
 
 
 class RequestCount:

@@ -67,7 +67,7 @@ class Results:
         trajectory = await self.trajectory()
         if component is not None and component not in trajectory.components:
             known = ", ".join(map(str, trajectory.components)) or "none"
-            raise NothingYetError(f"the trajectory has no component {component}: there are {known}")
+            raise NothingYetError(f"the trajectory has no component {component}: its components are {known}")
         key = (id(trajectory), wanted, frames, component)
         built = await self._texts.get(key, lambda: _write(trajectory, wanted, frames, component))
         return built.value

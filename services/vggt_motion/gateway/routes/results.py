@@ -59,10 +59,17 @@ class TrajectoryQuery(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    format: TrajectoryFormat = Field("json", description="tum and kitti hold poses only, csv and json every frame")
-    frames: FrameChoice = Field("key", description="keyframes, or every input frame of closed segments")
+    format: TrajectoryFormat = Field(
+        "json", description="tum and kitti hold poses only, csv and json what each frame is, too", examples=["tum"]
+    )
+    frames: FrameChoice = Field(
+        "key", description="keyframes, or every input frame of closed segments", examples=["all"]
+    )
     component: int | None = Field(
-        None, ge=0, description="one connected part of a broken trajectory; parts share no frame of reference"
+        None,
+        ge=0,
+        description="one connected part of a broken trajectory; parts share no frame of reference",
+        examples=[0],
     )
 
 
