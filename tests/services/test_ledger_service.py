@@ -25,6 +25,7 @@ from ledger_processes import (
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.follow import Follower
 from vggt_motion.bus.ledger import append_request
+from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.errors import (
     BusUnavailableError,
     DiskFullError,
@@ -108,6 +109,25 @@ def test_a_job_is_claimed_done_and_seen(running: Site) -> None:
     assert entry.record_id == lease.job.job_id
     counts = {(count.kind, count.state): count.count for count in running.status().job_counts}
     assert counts == {("predict", "done"): 1, ("predict", "open"): 1}
+
+
+def test_health_counts_the_jobs_of_this_moment(running: Site) -> None:
+    watch = ServiceWatch(running.bus)
+
+    def counted(state: str) -> float | None:
+        reports = [report for (service, _), report in watch.services().items() if service == "ledger"]
+        return reports[0].counters.get(f"jobs_predict_{state}") if reports and reports[0] is not None else None
+
+    jobs = running.jobs()
+    jobs.submit([predict(0)])
+    wait_until(lambda: counted("open") == 1.0)
+    lease = jobs.claim(PREDICT, [], "inference/a", 0.0)
+    assert lease is not None
+    wait_until(lambda: (counted("open"), counted("leased")) == (0.0, 1.0))
+    depth = depth_blob(0)
+    assert jobs.done(lease, "submap", lease.job.job_id, submap(0, depth, 1.0), [depth])
+    wait_until(lambda: (counted("open"), counted("leased"), counted("done")) == (0.0, 0.0, 1.0))
+    watch.close()
 
 
 def test_a_dead_job_is_told_on_the_log_with_the_workers_reason(running: Site) -> None:

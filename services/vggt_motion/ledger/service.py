@@ -179,6 +179,8 @@ def _watch(context: ServiceContext, ledger: Ledger, desk: Desk, presence: Presen
 
 def _report(context: ServiceContext, status: LedgerStatus) -> None:
     counters = {f"records_{position.stream}": float(position.next_sequence) for position in status.positions}
+    # Every one each time: health keeps what is not named, and a state that nobody is in any more is not counted.
+    counters |= {f"jobs_{kind}_{state}": 0.0 for kind in JobKind for state in JobState}
     counters |= {f"jobs_{count.kind}_{count.state}": float(count.count) for count in status.job_counts}
     context.set_health(
         "working" if status.is_accepting else "waiting",
