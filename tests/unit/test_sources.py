@@ -235,11 +235,12 @@ def test_text_named_jpg_in_the_middle_ends_the_input_there(tmp_path: Path) -> No
     assert error is not None and "frame 3" in str(error) and "3.png" in str(error)
 
 
-def test_text_named_mp4_is_no_video(tmp_path: Path) -> None:
+def test_text_named_mp4_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mp4"
     path.write_text("hello")
     with pytest.raises(SourceError, match="not a readable video"):
         open_source(str(path))
+    assert capfd.readouterr().err == "", "the libraries below must not add lines of their own"
 
 
 def test_video_frames_times_and_determinism(tmp_path: Path) -> None:

@@ -121,11 +121,13 @@ class VideoFile:
 
 
 def quiet_ffmpeg() -> None:
-    """Keep FFmpeg from reporting each damaged macro-block on stderr: we say it once, in our words.
+    """Keep FFmpeg and OpenCV from reporting on stderr what we say once, in our words: no video, a damaged macro-block.
 
-    OpenCV reads the variable at its first capture; what a user has set stays.
+    OpenCV reads the variable for FFmpeg at its first capture; what a user has set stays.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 def _open(path: Path) -> cv2.VideoCapture:
