@@ -208,7 +208,8 @@ class SkyConfig(Section):
 class InferenceConfig(Section):
     """The predictor and its worker."""
 
-    predictor: str = "sfm"
+    predictor: str = Field("sfm", description="auto = vggt where torch, an accelerator and weights are there, else sfm")
+    predictor_reason: str = Field("", description="why auto became what it is; written by run")
     focal_over_width: float | None = Field(
         None, gt=0.1, lt=20, description="known focal length / image width; None = self-calibrate"
     )
@@ -265,7 +266,7 @@ class BackendConfig(Section):
     solve_deadline_s: float = Field(120.0, gt=0)
     map_confidence: float = Field(0.5, ge=0, le=1, description="points below this confidence stay out of the map")
     map_voxel_over_step: float = Field(
-        0.1, ge=0, description="voxel edge as a share of the median keyframe distance; 0 = none"
+        0.05, ge=0, description="voxel edge as a share of the median keyframe distance; 0 = none"
     )
     map_max_points: int = Field(2_000_000, ge=1000)
     known_distance_m: float | None = Field(None, gt=0, description="known travelled distance: sets the scale")

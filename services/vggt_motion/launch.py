@@ -20,6 +20,7 @@ from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus, open_bus
 from vggt_motion.config import BusConfig, Config
 from vggt_motion.errors import BusError, InputError, VggtMotionError
+from vggt_motion.inference.registry import choose_predictor
 from vggt_motion.ledger.sessions import SessionIdentity
 from vggt_motion.records import HealthReport, MotionState, Stream
 from vggt_motion.sources.registry import open_source
@@ -85,13 +86,16 @@ class RunOutcome:
 
 def session_identity(request: RunRequest, source: Source) -> SessionIdentity:
     """What makes two runs the same one: the input, the part of it, and everything that decides the result."""
-    config = request.config
+    config = with_chosen_predictor(request.config)
     mask = hashlib.sha256(request.ego_mask.read_bytes()).hexdigest() if request.ego_mask is not None else None
     method = {
         "selection": [request.start, request.end, request.stride],
         "ego_mask": mask,
         "camera": config.run.camera,
-        **{name: getattr(config, name).model_dump(mode="json") for name in _METHOD_SECTIONS},
+        **{
+            name: getattr(config, name).model_dump(mode="json", exclude={"predictor_reason"})
+            for name in _METHOD_SECTIONS
+        },
     }
     digest = hashlib.sha256(json.dumps(method, sort_keys=True).encode()).hexdigest()
     return SessionIdentity(source.description, source.fingerprint, digest)
@@ -126,6 +130,13 @@ def with_free_endpoint(config: Config) -> Config:
         return config
     bus = config.bus.model_copy(update={"endpoint": f"tcp/127.0.0.1:{free_port()}"})
     return config.model_copy(update={"bus": bus})
+
+
+def with_chosen_predictor(config: Config) -> Config:
+    """The configuration with ``auto`` replaced by a name, so that all workers offer the same predictor."""
+    name, reason = choose_predictor(config.inference)
+    inference = config.inference.model_copy(update={"predictor": name, "predictor_reason": reason})
+    return config.model_copy(update={"inference": inference})
 
 
 def service_commands(request: RunRequest, config_file: Path) -> list[ServiceCommand]:
@@ -178,7 +189,7 @@ class LocalRun:
             raise InputError(f"no ego mask at {request.ego_mask}")
         self.identity = session_identity(request, source)
         check_port(request.config.gateway.host, request.config.gateway.port)
-        config = with_free_endpoint(request.config)
+        config = with_chosen_predictor(with_free_endpoint(request.config))
         if config.spool.directory is None:
             spool = config.spool.model_copy(update={"directory": request.out.absolute() / SPOOL_FOLDER})
             config = config.model_copy(update={"spool": spool})

@@ -19,8 +19,7 @@ import numpy as np
 
 from vggt_motion import __version__
 from vggt_motion.backend import focal
-from vggt_motion.backend.map import PointMap, build_map
-from vggt_motion.backend.map_frames import map_frames
+from vggt_motion.backend.session_map import build_session_map, main_component
 from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
 from vggt_motion.config import Config
@@ -56,6 +55,8 @@ class RunFacts:
     wall_seconds: float
     start_up_seconds: float
     restart_count: int
+    predictor: str = ""
+    predictor_reason: str = ""
     first_frame: int = 0  # of the source, with --start and --stride: which line of the ground truth frame n belongs to
     stride: int = 1
     dead_jobs: tuple[JobReport, ...] = ()
@@ -105,8 +106,10 @@ def write_results(
     )
     is_metric = bool(submaps) and all(g.scale_kind is ScaleKind.METRIC for g in submaps.values())
     has_metres = is_metric or config.backend.known_distance_m is not None
-    component = _main_component(trajectory)
-    cloud = _build_cloud(state, graph, trajectory, component, config, load_blob)
+    component = main_component(trajectory)
+    cloud = None
+    if component != NO_COMPONENT and graph.poses:
+        cloud = build_session_map(state.keyframes, submaps, graph, trajectory, config.backend, load_blob)
     reference = _reference_of(trajectory, ground_truth, facts)
     metrics = _metrics(state, trajectory, facts, component, has_metres=has_metres)
     truth = None
@@ -161,12 +164,6 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _main_component(trajectory: Trajectory) -> int:
-    """The connected part with the most frames; the first of equals."""
-    counts = Counter(frame.component for frame in trajectory.frames if frame.component != NO_COMPONENT)
-    return min(counts, key=lambda component: (-counts[component], component), default=NO_COMPONENT)
-
-
 def _component_track(frames: tuple[TrajectoryPose, ...]) -> ComponentTrack:
     posed = [frame for frame in frames if frame.world_from_camera is not None]
     if not posed:
@@ -176,23 +173,6 @@ def _component_track(frames: tuple[TrajectoryPose, ...]) -> ComponentTrack:
         np.array([frame.world_from_camera for frame in posed], dtype=np.float64),
     )
     return ComponentTrack(track, np.array([frame.component for frame in posed], dtype=np.int64))
-
-
-def _build_cloud(
-    state: LogState,
-    graph: GraphUpdate,
-    trajectory: Trajectory,
-    component: int,
-    config: Config,
-    load_blob: Callable[[BlobRef], bytes],
-) -> PointMap | None:
-    if component == NO_COMPONENT or not graph.poses:
-        return None
-    steps = np.linalg.norm(np.diff(trajectory.track("key", component).positions, axis=0), axis=1)
-    moving = steps[steps > 0.0]
-    frames = map_frames(state.keyframes, state.usable_submaps(), graph, component, load_blob)
-    step = float(np.median(moving)) if len(moving) else 0.0
-    return build_map(frames, config.backend, step=step, scale=trajectory.scale)
 
 
 def _camera_view(
@@ -269,6 +249,8 @@ def _metrics(
     return {
         "version": __version__,
         "source": facts.source,
+        "predictor": facts.predictor,
+        "predictor_reason": facts.predictor_reason,
         "exit_code": facts.exit_code,
         "is_complete": graph is not None and graph.is_final and not facts.interrupted,
         "truncated": ended.detail.get("truncated", "") if ended is not None else "",

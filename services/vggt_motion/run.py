@@ -124,6 +124,8 @@ def _write_results(
         wall_seconds=outcome.seconds,
         start_up_seconds=outcome.start_up_seconds,
         restart_count=outcome.restart_count,
+        predictor=run.config.inference.predictor,
+        predictor_reason=run.config.inference.predictor_reason,
         first_frame=request.start,
         stride=request.stride,
         dead_jobs=tuple(JobClient(bus).reports(JobState.DEAD)) if outcome.state.dead_jobs else (),

@@ -18,7 +18,8 @@ from rule_weights import rule_weights  # noqa: E402
 from vggt_motion.bus import codec  # noqa: E402
 from vggt_motion.config import InferenceConfig, VggtConfig  # noqa: E402
 from vggt_motion.evaluation.trajectory_io import read_tum  # noqa: E402
-from vggt_motion.inference.predictor import KeyframeImage, PredictionHints, create_predictor  # noqa: E402
+from vggt_motion.inference.predictor import KeyframeImage, PredictionHints  # noqa: E402
+from vggt_motion.inference.registry import create_predictor  # noqa: E402
 from vggt_motion.inference.vggt.architecture import SMALL  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
 from vggt_motion.records import SubmapGeometry, SubmapVerdict  # noqa: E402

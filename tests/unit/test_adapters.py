@@ -27,7 +27,8 @@ from vggt_motion.inference import depth_anything, map_anything, pi3
 from vggt_motion.inference.foreign import child
 from vggt_motion.inference.foreign.process import ForeignPredictor, ForeignProcess, MissingOutputError, fit_pinhole
 from vggt_motion.inference.lattice import Lattice
-from vggt_motion.inference.predictor import KeyframeImage, Prediction, PredictionHints, create_predictor
+from vggt_motion.inference.predictor import KeyframeImage, Prediction, PredictionHints
+from vggt_motion.inference.registry import create_predictor
 from vggt_motion.records import ScaleKind, SubmapVerdict
 
 Array = npt.NDArray[np.float64]

@@ -10,7 +10,8 @@ from vggt_motion.bus import codec
 from vggt_motion.bus.ledger import append_request
 from vggt_motion.config import Config, InferenceConfig, RecordedConfig
 from vggt_motion.errors import ConfigurationError, PredictionError
-from vggt_motion.inference.predictor import KeyframeImage, PredictionHints, create_predictor
+from vggt_motion.inference.predictor import KeyframeImage, PredictionHints
+from vggt_motion.inference.registry import create_predictor
 from vggt_motion.ledger.service import Desk, open_session
 from vggt_motion.records import FocalHint, Stream, SubmapVerdict
 

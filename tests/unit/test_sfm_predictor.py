@@ -11,7 +11,8 @@ import pytest
 
 from vggt_motion.config import InferenceConfig
 from vggt_motion.errors import MissingDependencyError
-from vggt_motion.inference.predictor import KeyframeImage, Prediction, PredictionHints, create_predictor
+from vggt_motion.inference.predictor import KeyframeImage, Prediction, PredictionHints
+from vggt_motion.inference.registry import create_predictor
 from vggt_motion.inference.sfm import library
 from vggt_motion.records import SubmapVerdict
 

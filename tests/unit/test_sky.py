@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vggt_motion.config import InferenceConfig, SkyConfig
 from vggt_motion.errors import InputError, MissingDependencyError, PredictionError
 from vggt_motion.geometry.projection import Intrinsics
-from vggt_motion.inference import predictor as contract
+from vggt_motion.inference import registry
 from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints
 from vggt_motion.inference.sky import NoSky, OnnxSky, SkyMasking, create_segmenter, sky_from_probability
 from vggt_motion.records import ScaleKind, SubmapQuality, SubmapVerdict
@@ -193,9 +193,9 @@ def test_a_masked_prediction_has_no_depth_in_the_sky(blue_is_sky: Path) -> None:
 
 
 def test_the_configuration_wraps_any_predictor(blue_is_sky: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(contract._REGISTRY, "flat", f"{__name__}:create_flat")
-    assert isinstance(contract.create_predictor("flat", InferenceConfig()), Flat)
-    wrapped = contract.create_predictor("flat", InferenceConfig(sky=SkyConfig(model=blue_is_sky)))
+    monkeypatch.setitem(registry._REGISTRY, "flat", f"{__name__}:create_flat")
+    assert isinstance(registry.create_predictor("flat", InferenceConfig()), Flat)
+    wrapped = registry.create_predictor("flat", InferenceConfig(sky=SkyConfig(model=blue_is_sky)))
     assert isinstance(wrapped, SkyMasking)
     assert wrapped.name == "flat"
 

@@ -20,13 +20,8 @@ from vggt_motion.errors import ConfigurationError, InputError, MissingDependency
 from vggt_motion.geometry import se3  # noqa: E402
 from vggt_motion.inference import vggt  # noqa: E402
 from vggt_motion.inference.lattice import fit_width  # noqa: E402
-from vggt_motion.inference.predictor import (  # noqa: E402
-    KeyframeImage,
-    PredictionHints,
-    choose_predictor,
-    create_predictor,
-    predictor_names,
-)
+from vggt_motion.inference.predictor import KeyframeImage, PredictionHints  # noqa: E402
+from vggt_motion.inference.registry import choose_predictor, create_predictor, predictor_names  # noqa: E402
 from vggt_motion.inference.vggt import device as devices  # noqa: E402
 from vggt_motion.inference.vggt import predictor as module  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
@@ -284,7 +279,7 @@ class TestWhatIsMissingIsSaid:
 
     def test_nothing_else_imports_torch(self) -> None:
         code = (
-            "import sys; import vggt_motion.inference.vggt, vggt_motion.inference.predictor as p; "
+            "import sys; import vggt_motion.inference.vggt, vggt_motion.inference.registry as p; "
             "from vggt_motion.config import InferenceConfig; p.choose_predictor(InferenceConfig(predictor='auto')); "
             "import vggt_motion.inference.sky; assert 'torch' not in sys.modules, 'torch was imported'"
         )

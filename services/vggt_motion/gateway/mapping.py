@@ -5,10 +5,10 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from vggt_motion.backend.session_map import build_session_map
 from vggt_motion.errors import VggtMotionError
 from vggt_motion.gateway.results import compose_snapshot
 from vggt_motion.gateway.state import GatewayState, Snapshot
-from vggt_motion.session_map import build_session_map
 
 
 def map_as_ply(snapshot: Snapshot, state: GatewayState) -> bytes:

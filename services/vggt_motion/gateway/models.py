@@ -138,6 +138,9 @@ class PredictorStatus(Answer):
     """Who makes the geometry."""
 
     configured: str = Field(examples=["sfm"])
+    reason: str = Field(
+        description="why it was chosen, where `auto` was asked for", examples=["chosen by the configuration"]
+    )
     models: dict[str, int] = Field(description="submaps by the model that made them", examples=[{"sfm": 8}])
 
 

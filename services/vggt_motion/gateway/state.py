@@ -210,6 +210,7 @@ class GatewayState:
                 lag=self._lag(),
                 predictor=PredictorStatus(
                     configured=self.config.inference.predictor,
+                    reason=self.config.inference.predictor_reason,
                     models=dict(Counter(model for _, _, model in self._verdicts.values())),
                 ),
                 notices=list(self._notices),

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from vggt_motion.bus.depth import encode_depth
 from vggt_motion.config import InferenceConfig
 from vggt_motion.errors import PredictionError
-from vggt_motion.inference.predictor import KeyframeImage, PredictionHints, Predictor, create_predictor
+from vggt_motion.inference.predictor import KeyframeImage, PredictionHints, Predictor
+from vggt_motion.inference.registry import create_predictor
 from vggt_motion.records import BlobRef, FrameGeometry, PredictTask, SubmapGeometry
 
 DEPTH_MEDIA_TYPE = "application/vnd.vggt-motion.depth"

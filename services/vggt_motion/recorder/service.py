@@ -12,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+from vggt_motion.backend.session_map import build_session_map
 from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import compose
 from vggt_motion.bus import codec
@@ -41,7 +42,6 @@ from vggt_motion.records import (
     Stream,
     SubmapGeometry,
 )
-from vggt_motion.session_map import build_session_map
 from vggt_motion.sources.source import Frame
 
 _log = logging.getLogger(__name__)

@@ -11,9 +11,9 @@ import numpy as np
 
 from vggt_motion import foxglove
 from vggt_motion.backend.map import PointMap
+from vggt_motion.backend.session_map import main_component
 from vggt_motion.backend.trajectory import Trajectory, TrajectoryPose
 from vggt_motion.recorder.record import MAP_TOPIC, TRAJECTORY_TOPIC, FrameId, Recording
-from vggt_motion.session_map import main_component
 
 _TRAJECTORY_GROWTH = 1.1
 _MAP_GROWTH = 1.5
