@@ -48,6 +48,7 @@ class CameraPrior:
         if known is not None:
             yield known, True
             # a wrong hint is contradicted best from afar
+            usual = [start for start in usual if abs(math.log(start / known)) > _SURE_RELATIVE_SIGMA]
             usual.sort(key=lambda start: -abs(math.log(start / known)))
         if self.is_fixed:
             return

@@ -25,8 +25,11 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 _REGROW_RELATIVE = 0.05  # a focal length that moved so far is grown from once more
-_GOOD_EXPLAINED = 0.75  # share of observations that fit, and
-_GOOD_REPROJECTION_PX = 0.5  # how well, with which no further start is tried
+# Share of observations that fit, alone or with how well they fit, for which no further start is tried: cars that drive
+# along let a wrong scene explain four fifths of them, but badly.
+_MOST_EXPLAINED = 0.88
+_GOOD_EXPLAINED = 0.75
+_GOOD_REPROJECTION_PX = 0.5
 _MAX_K1 = 0.6  # beyond it a coefficient describes the scene, not a lens
 _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong distortion is believed
 _CAPPED_PX = 1.5  # an observation that misses by more belongs to something else, however far it misses
@@ -165,6 +168,8 @@ def _polished(
 
 def _is_convincing(solved: Structure) -> bool:
     """Whether no further start is worth its time."""
+    if solved.explained > _MOST_EXPLAINED:
+        return True
     return solved.explained > _GOOD_EXPLAINED and solved.reprojection_px < _GOOD_REPROJECTION_PX
 
 
