@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from vggt_motion.errors import SourceError, SourceTruncatedError
+from vggt_motion.sources.bitstream import Size, size_reader
 from vggt_motion.sources.encoded import JPEG, encode_video_frame
 from vggt_motion.sources.selection import Selection
 from vggt_motion.sources.source import Frame
@@ -69,16 +70,17 @@ class VideoFile:
 
     def frames(self) -> Iterator[Frame]:
         """The frames in time order; see :class:`vggt_motion.sources.source.Source`."""
-        capture = _open(self._path)
+        capture, sizes = _open(self._path), _AnnouncedSizes(self._path)
         try:
-            yield from self._read(capture)
+            yield from self._read(capture, sizes)
         finally:
             capture.release()
+            sizes.close()
 
     def close(self) -> None:
         """The file is only open while it is iterated."""
 
-    def _read(self, capture: cv2.VideoCapture) -> Iterator[Frame]:
+    def _read(self, capture: cv2.VideoCapture, sizes: _AnnouncedSizes) -> Iterator[Frame]:
         selection = self._selection
         repair = TimestampRepair(self._interval_ns, str(self._path))
         index = position = time_ns = 0
@@ -86,6 +88,12 @@ class VideoFile:
         while not selection.is_past(position):
             if not capture.grab():
                 break
+            change = sizes.next_change()
+            if change is not None and position:
+                raise SourceTruncatedError(
+                    f"{self._path} changes size from {change[0]} to {change[1]} at frame {position}; "
+                    f"the input ends there and the {index} frames before it are used"
+                )
             if selection.takes(position):
                 ok, pixels = capture.retrieve()
                 if not ok:
@@ -118,6 +126,33 @@ class VideoFile:
             raise SourceTruncatedError(
                 f"{self._path} is truncated or damaged: {read} of {self._promised} frames are readable; {used} are used"
             )
+
+
+class _AnnouncedSizes:
+    """Reads the packets of a video beside its decoder; see :mod:`vggt_motion.sources.bitstream`."""
+
+    def __init__(self, path: Path) -> None:
+        self._capture = _open(path)
+        fourcc = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin-1")
+        reader = size_reader(fourcc)
+        # a capture that cannot give out packets gives pictures instead: they are not looked at
+        self._reader = reader if reader is not None and self._capture.set(cv2.CAP_PROP_FORMAT, -1) else None
+        self._size: Size | None = None
+
+    def next_change(self) -> tuple[str, str] | None:
+        """Take the next packet; the old and the new size where it announces another one than before."""
+        if self._reader is None:
+            return None
+        ok, packet = self._capture.read()
+        size = self._reader(np.asarray(packet, np.uint8).tobytes()) if ok else None
+        if size is None or size == self._size:
+            return None
+        before, self._size = self._size, size
+        return None if before is None else (f"{before[0]}x{before[1]}", f"{size[0]}x{size[1]}")
+
+    def close(self) -> None:
+        """Release the file."""
+        self._capture.release()
 
 
 def quiet_ffmpeg() -> None:
