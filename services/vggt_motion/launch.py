@@ -20,6 +20,7 @@ from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus, open_bus
 from vggt_motion.config import BusConfig, Config
 from vggt_motion.errors import BusError, InputError, VggtMotionError
+from vggt_motion.gateway.security import check_exposure
 from vggt_motion.inference.registry import choose_predictor
 from vggt_motion.ledger.sessions import SessionIdentity
 from vggt_motion.records import HealthReport, MotionState, Stream
@@ -188,6 +189,7 @@ class LocalRun:
         if request.ego_mask is not None and not request.ego_mask.is_file():
             raise InputError(f"no ego mask at {request.ego_mask}")
         self.identity = session_identity(request, source)
+        check_exposure(request.config.gateway)
         check_port(request.config.gateway.host, request.config.gateway.port)
         config = with_chosen_predictor(with_free_endpoint(request.config))
         if config.spool.directory is None:

@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 
 from vggt_motion import __version__
-from vggt_motion.backend import focal
+from vggt_motion.backend import focal, posegraph
+from vggt_motion.backend.planner import current_constraints
 from vggt_motion.backend.session_map import build_session_map, main_component
 from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
@@ -98,6 +99,7 @@ def write_results(
     Raises:
         InputError: a file cannot be written.
     """
+    _catch_up(state, config)
     graph = state.latest_graph() or GraphUpdate(0, False, (), ())
     submaps = state.usable_submaps()
     segments = tuple(state.segments[index] for index in sorted(state.segments))
@@ -149,6 +151,17 @@ def write_results(
     except OSError as error:
         raise InputError(f"cannot write results to {out}: {error.strerror or error}") from error
     return metrics
+
+
+def _catch_up(state: LogState, config: Config) -> None:
+    """Solve what came after the newest graph, where a run was ended before the backend did."""
+    graph = state.latest_graph()
+    inputs = len(state.submaps) + len(state.constraints)
+    nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
+    if not nodes or (graph is not None and (graph.is_final or graph.revision >= inputs)):
+        return
+    constraints = current_constraints(state)
+    state.apply(posegraph.solve(nodes, constraints, config.backend, revision=inputs, is_final=False))
 
 
 def _write(path: Path, text: str) -> None:
@@ -287,7 +300,7 @@ def warnings(state: LogState, trajectory: Trajectory) -> list[str]:
     ended = state.stream_ended
     if ended is not None and ended.detail.get("truncated"):
         lines.append(f"the input ended early: {ended.detail['truncated']}")
-    if trajectory.frames and trajectory.path_length() == 0.0:
+    if len(trajectory.track("all")) > 1 and trajectory.path_length() == 0.0:
         lines.append("the camera did not move, or nothing shows that it did: all poses are the same")
     graph = state.latest_graph()
     lines.extend(graph.breaks if graph is not None else ())

@@ -119,7 +119,7 @@ def _write_results(
 ) -> dict[str, Any]:
     facts = results.RunFacts(
         source=run.source_description,
-        exit_code=outcome.exit_code,
+        exit_code=INTERRUPTED_EXIT_CODE if outcome.interrupted else outcome.exit_code,
         interrupted=outcome.interrupted,
         wall_seconds=outcome.seconds,
         start_up_seconds=outcome.start_up_seconds,

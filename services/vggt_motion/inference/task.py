@@ -14,6 +14,7 @@ import numpy.typing as npt
 from vggt_motion.bus.depth import encode_depth
 from vggt_motion.config import InferenceConfig
 from vggt_motion.errors import PredictionError
+from vggt_motion.geometry import se3
 from vggt_motion.inference.predictor import KeyframeImage, PredictionHints, Predictor
 from vggt_motion.inference.registry import create_predictor
 from vggt_motion.records import BlobRef, FrameGeometry, PredictTask, SubmapGeometry
@@ -56,12 +57,15 @@ def predict_submap(
     decode_seconds = time.perf_counter() - begin
     prediction = _predictor(config).predict(decoded, hints)
     begin = time.perf_counter()
+    # The submap's frame is that of its first camera, whatever the predictor chose: so the world begins there too.
+    submap_from_predicted = se3.inverse(prediction.frames[0].submap_from_camera) if prediction.frames else np.eye(4)
     frames, blobs = [], []
     for frame in prediction.frames:
         blob = encode_depth(frame.depth, frame.confidence)
         ref = BlobRef(hashlib.sha256(blob).hexdigest(), len(blob), DEPTH_MEDIA_TYPE)
         keyframe_id = task.keyframes[frame.position].keyframe_id
-        frames.append(FrameGeometry(keyframe_id, frame.intrinsics, frame.submap_from_camera, ref))
+        submap_from_camera = submap_from_predicted @ frame.submap_from_camera
+        frames.append(FrameGeometry(keyframe_id, frame.intrinsics, submap_from_camera, ref))
         blobs.append(blob)
     seconds = dict(prediction.stage_seconds)
     seconds.update(decode=decode_seconds, encode=time.perf_counter() - begin)
