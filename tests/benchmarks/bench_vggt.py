@@ -76,15 +76,16 @@ class PlainPass:
     def __init__(self, model: Vggt):
         self.model = model
         model.set_row_chunk(None)
+        model.aggregator.embedded_frames = 10**6
 
     @torch.inference_mode()
     def __call__(self, images: Tensor) -> VggtOutput:
         model, stopwatch = self.model, Stopwatch(images.device)
-        frames, _, height, width = images.shape[1:]
+        height, width = images.shape[-2:]
         every = frozenset(range(model.architecture.depth))
         kept = [
             torch.cat([level.of_frames, level.of_global], dim=-1)
-            for level in model.aggregator.levels(images, every, frame_chunk=frames, stopwatch=stopwatch)
+            for level in model.aggregator.levels(images, every, stopwatch=stopwatch)
         ]
         with stopwatch("camera_head"):
             pose = model.camera_head(kept[-1][:, :, 0])

@@ -42,6 +42,7 @@ class Aggregator(nn.Module):
         super().__init__()
         width, heads = architecture.width, architecture.heads
         self.architecture = architecture
+        self.embedded_frames = 8  # at a time; blocks bound their memory themselves
         self.camera_token = nn.Parameter(torch.zeros(1, 2, 1, width))
         self.register_token = nn.Parameter(torch.zeros(1, 2, architecture.register_tokens, width))
         self.patch_embed = VisionTransformer(
@@ -54,38 +55,32 @@ class Aggregator(nn.Module):
             Block(width, heads, norm_eps=_NORM_EPS, normalise_queries=True) for _ in range(architecture.depth)
         )
 
-    def levels(
-        self, images: Tensor, wanted: frozenset[int], *, frame_chunk: int, stopwatch: Stopwatch
-    ) -> Iterator[Level]:
+    def levels(self, images: Tensor, wanted: frozenset[int], *, stopwatch: Stopwatch) -> Iterator[Level]:
         """Run the network and hand out the wanted levels, in order.
 
         Args:
             images: (B, S, 3, H, W) RGB in [0, 1].
             wanted: level numbers; the others are not kept.
-            frame_chunk: frames that go through patch embedding and frame attention at a time.
             stopwatch: takes the time of each part.
         """
         batch, frames = images.shape[:2]
         rows, columns = (side // self.architecture.patch_px for side in images.shape[-2:])
         with stopwatch("patch_embedding"):
-            stream = self._embed(images, frame_chunk)
+            stream = self._embed(images)
         token_count = stream.shape[1]
-        rotary = Rotary(self._positions(rows, columns, stream.device), stream.shape[-1] // self.architecture.heads)
-        rotary_of_all = rotary.repeated(batch * frames)
+        positions = self._positions(rows, columns, stream.device)
+        rotary = Rotary(positions, stream.shape[-1] // self.architecture.heads).repeated(batch * frames)
         for index in range(self.architecture.depth):
             with stopwatch("frame_attention"):
-                stream = stream.view(batch * frames, token_count, -1)
-                for start in range(0, batch * frames, frame_chunk):
-                    part = stream[start : start + frame_chunk]  # a view: the block writes to it
-                    self.frame_blocks[index](part, rotary.repeated(len(part)))
+                stream = self.frame_blocks[index](stream.view(batch * frames, token_count, -1), rotary)
             of_frames = stream.clone() if index in wanted else None
             with stopwatch("global_attention"):
-                stream = self.global_blocks[index](stream.view(batch, frames * token_count, -1), rotary_of_all)
+                stream = self.global_blocks[index](stream.view(batch, frames * token_count, -1), rotary)
             if of_frames is not None:
                 shape = (batch, frames, token_count, stream.shape[-1])
                 yield Level(index, of_frames.view(shape), stream.view(shape))
 
-    def _embed(self, images: Tensor, frame_chunk: int) -> Tensor:
+    def _embed(self, images: Tensor) -> Tensor:
         """Camera token, registers and patch tokens of every frame: (B * S, T, C) float32."""
         batch, frames = images.shape[:2]
         flat = images.flatten(0, 1)
@@ -102,8 +97,8 @@ class Aggregator(nn.Module):
         count = leading.shape[1]
         stream = torch.empty(batch * frames, count + patch_count, leading.shape[2], device=images.device)
         stream[:, :count] = leading
-        for start in range(0, batch * frames, frame_chunk):
-            part = slice(start, start + frame_chunk)
+        for start in range(0, batch * frames, self.embedded_frames):
+            part = slice(start, start + self.embedded_frames)
             stream[part, count:] = self.patch_embed.patch_tokens((flat[part].float() - mean) / deviation)
         return stream
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 _ROTARY_BASE = 100.0
 CPU_ROW_CHUNK = 1024  # as fast as any on a CPU, and the smallest such
 ACCELERATOR_ROW_CHUNK = 16384
+_QUERY_CHUNKS = 2  # attention is slower by a twentieth on queries that are fewer
 
 
 class Linear(nn.Linear):
@@ -75,20 +76,32 @@ class Attention(nn.Module):
         self.k_norm: nn.Module = nn.LayerNorm(width // heads, eps=1e-5) if normalise_queries else nn.Identity()
         self.proj = Linear(width, width)
 
-    def project(self, rows: Tensor, rotary: Rotary | None, into: tuple[Tensor, Tensor, Tensor]) -> None:
-        """Queries, keys and values of rows (R, width), written to three tensors (R, heads, width / heads)."""
-        qkv: Tensor = self.qkv(rows)
-        q, k, v = qkv.view(len(rows), 3, self.heads, -1).unbind(1)
-        if rotary is not None:
-            # Angles and norms in float32: in bfloat16 a rotation would be off by up to 1/256 rad.
-            q, k = rotary(self.q_norm(q.float())), rotary(self.k_norm(k.float()))
-        for target, value in zip(into, (q, k, v), strict=True):
-            target.copy_(value)
+    def queries(self, rows: Tensor, rotary: Rotary | None) -> Tensor:
+        """Queries (R, heads, width / heads) of rows (R, width), in the weights' dtype."""
+        q = self._heads(rows, 0, 1)[:, 0]
+        return q if rotary is None else rotary(self.q_norm(q.float())).to(q.dtype)
+
+    def write_keys_values(self, rows: Tensor, rotary: Rotary | None, keys: Tensor, values: Tensor) -> None:
+        """Write keys and values of rows (R, width) to two tensors (R, heads, width / heads)."""
+        k, v = self._heads(rows, 1, 3).unbind(1)
+        # Angles and norms in float32: in bfloat16 a rotation would be off by up to 1/256 rad.
+        keys.copy_(k if rotary is None else rotary(self.k_norm(k.float())))
+        values.copy_(v)
 
     def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """(B, N, heads, width / heads) each to (B * N, width): within each of the B sequences every token sees all."""
+        """Result (B * M, width) of queries (B, M, heads, c) on keys and values (B, N, heads, c) of their sequences."""
         attended = F.scaled_dot_product_attention(q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2))
-        return attended.transpose(1, 2).flatten(2).flatten(0, 1)
+        projected: Tensor = self.proj(attended.transpose(1, 2).flatten(2).flatten(0, 1))
+        return projected
+
+    def _heads(self, rows: Tensor, first: int, stop: int) -> Tensor:
+        """(R, stop - first, heads, c): some of queries, keys and values, whose weights lie one after the other."""
+        width = rows.shape[-1]
+        part = slice(first * width, stop * width)
+        weight = self.qkv.weight[part]
+        return F.linear(rows.to(weight.dtype), weight, self.qkv.bias[part]).view(
+            len(rows), stop - first, self.heads, -1
+        )
 
 
 class Mlp(nn.Module):
@@ -120,8 +133,8 @@ class LayerScale(nn.Module):
 class Block(nn.Module):
     """Pre-norm transformer block with LayerScale on both branches.
 
-    All but the attention itself works on ``row_chunk`` tokens at a time: what lies between two matrix products then
-    stays in the cache, and only queries, keys, values and their result are ever there for all tokens.
+    It works on ``row_chunk`` tokens at a time: what lies between two matrix products then stays in the cache, and
+    beside the stream only the keys and values of one sequence are ever there in full.
     """
 
     def __init__(self, width: int, heads: int, *, norm_eps: float, normalise_queries: bool = False):
@@ -142,20 +155,32 @@ class Block(nn.Module):
             rotary: tables for all B * N tokens.
         """
         batch, tokens, width = stream.shape
-        rows = stream.view(batch * tokens, width)
-        chunk = self.row_chunk or len(rows)
-        parts = [slice(start, start + chunk) for start in range(0, len(rows), chunk)]
-        shape = (len(rows), self.attn.heads, width // self.attn.heads)
-        q, k, v = (torch.empty(shape, dtype=self.attn.qkv.weight.dtype, device=stream.device) for _ in range(3))
-        for part in parts:
-            turn = None if rotary is None else rotary.rows(part)
-            self.attn.project(self.norm1(rows[part]), turn, (q[part], k[part], v[part]))
-        of_sequences = (batch, tokens, *shape[1:])
-        attended = self.attn.attend(q.view(of_sequences), k.view(of_sequences), v.view(of_sequences))
-        del q, k, v
-        for part in parts:
-            self.ls1.add_to(rows[part], self.attn.proj(attended[part]))
-        del attended
-        for part in parts:
-            self.ls2.add_to(rows[part], self.mlp(self.norm2(rows[part])))
+        chunk = self.row_chunk or batch * tokens
+        together = max(1, chunk // tokens)  # whole sequences, or a part of one
+        for start in range(0, batch, together):
+            some = stream[start : start + together]
+            rows = slice(start * tokens, start * tokens + len(some) * tokens)
+            self._attend(some, None if rotary is None else rotary.rows(rows), chunk)
+        for part in torch.split(stream.view(batch * tokens, width), chunk):
+            self.ls2.add_to(part, self.mlp(self.norm2(part)))
         return stream
+
+    def _attend(self, sequences: Tensor, rotary: Rotary | None, chunk: int) -> None:
+        """The attention branch on sequences (B, N, width) that are not longer than ``chunk`` together, or on one."""
+        batch, tokens, width = sequences.shape
+        rows = sequences.view(batch * tokens, width)
+        shape = (batch, tokens, self.attn.heads, width // self.attn.heads)
+        keys, values = (torch.empty(shape, dtype=self.attn.qkv.weight.dtype, device=rows.device) for _ in range(2))
+        for part in _parts(len(rows), chunk):
+            turn = None if rotary is None else rotary.rows(part)
+            into = (keys.flatten(0, 1)[part], values.flatten(0, 1)[part])
+            self.attn.write_keys_values(self.norm1(rows[part]), turn, *into)
+        # Each row's query comes from that row alone, so rows can be replaced one part after the other.
+        for part in _parts(len(rows), _QUERY_CHUNKS * chunk):
+            turn = None if rotary is None else rotary.rows(part)
+            q = self.attn.queries(self.norm1(rows[part]), turn)
+            self.ls1.add_to(rows[part], self.attn.attend(q.view(batch, -1, *shape[2:]), keys, values))
+
+
+def _parts(count: int, chunk: int) -> list[slice]:
+    return [slice(start, start + chunk) for start in range(0, count, chunk)]

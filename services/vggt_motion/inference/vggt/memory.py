@@ -14,7 +14,7 @@ from vggt_motion.inference.vggt.layers import ACCELERATOR_ROW_CHUNK, CPU_ROW_CHU
 
 _FLOAT_BYTES = 4
 _MAX_FRAME_CHUNK = 16
-_CPU_FRAME_CHUNK = 2  # more frames at once are not faster on a CPU, only larger
+_CPU_FRAME_CHUNK = 1  # more frames at once are not faster on a CPU, only larger
 _LIBRARY_BYTES = 96 * 2**20  # packed operands of matrix products and convolutions
 
 
@@ -42,16 +42,16 @@ def pass_bytes(
         frames: B * S, all submaps of the batch.
         size: rows and columns of the network's images, pixels.
         dtype: of the transformer's matrix products.
-        frame_chunk: frames that patch embedding, frame attention and dense heads take at a time.
+        frame_chunk: frames that the dense heads take at a time.
         row_chunk: tokens that a block's matrix products take at a time.
     """
     patches = (size[0] // architecture.patch_px) * (size[1] // architecture.patch_px)
     tokens = frames * (patches + architecture.special_tokens)
     width, item = architecture.width, dtype.itemsize
-    # A block: the stream, queries, keys, values, their result and its rearrangement; for the rows at hand, the hidden
-    # layer before and after its activation, or queries and keys on their way through norm and rotation.
+    # A block: the stream, keys, values; for the rows at hand, the hidden layer before and after its activation, or
+    # queries and keys on their way through norm and rotation.
     rows = min(tokens, row_chunk)
-    block = tokens * width * (_FLOAT_BYTES + 5 * item) + rows * width * (8 * item + 6 * _FLOAT_BYTES)
+    block = tokens * width * (_FLOAT_BYTES + 2 * item) + rows * width * (8 * item + 6 * _FLOAT_BYTES)
     pixels = size[0] * size[1]
     channels = sum(architecture.dense_channels)
     images_and_outputs = frames * pixels * _FLOAT_BYTES * (3 + 2)

@@ -15,7 +15,7 @@ from vggt_motion.inference.vggt.layers import Block
 from vggt_motion.inference.vggt.stopwatch import Stopwatch
 from vggt_motion.inference.vggt.tracking import TrackingHead
 
-DEFAULT_FRAME_CHUNK = 2
+DEFAULT_FRAME_CHUNK = 1
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,7 @@ class Vggt(nn.Module):
 
         Args:
             images: (B, S, 3, H, W) RGB in [0, 1], sides divisible by 14.
-            frame_chunk: frames that patch embedding, frame attention and dense heads take at a time: it bounds the
-                memory and does not change the result.
+            frame_chunk: frames that dense heads take at a time: it bounds the memory and does not change the result.
         """
         batch, frames, _, height, width = images.shape
         stopwatch = Stopwatch(images.device)
@@ -72,7 +71,7 @@ class Vggt(nn.Module):
         camera_tokens: Tensor | None = None
         last = self.architecture.depth - 1
         wanted = frozenset(self.architecture.dense_levels) | {last}
-        for level in self.aggregator.levels(images, wanted, frame_chunk=frame_chunk, stopwatch=stopwatch):
+        for level in self.aggregator.levels(images, wanted, stopwatch=stopwatch):
             if level.index == last:
                 camera_tokens = level.tokens(slice(None), slice(0, 1)).view(batch, frames, -1)
             if level.index in self.architecture.dense_levels:
@@ -80,6 +79,7 @@ class Vggt(nn.Module):
                     for head, kept in zip(heads, maps, strict=True):
                         kept.append(self._project(head, level, (height, width), frame_chunk))
         assert camera_tokens is not None
+        del level  # the last one's tokens, which the heads need no more
         with stopwatch("camera_head"):
             pose_encoding = self.camera_head(camera_tokens)
         with stopwatch("dense_head"):
