@@ -30,6 +30,7 @@ from vggt_motion.errors import (
     InputError,
     RefusalCode,
     RequestRefusedError,
+    SourceError,
     SourceTruncatedError,
     VggtMotionError,
 )
@@ -133,6 +134,7 @@ class _Frontend:
                 encoding=_IMAGE_ENCODING,
             )
         self._thinned_count = 0
+        self._unreadable_count = 0
         self._thin_until_ns: int | None = None
         self._newest_time_ns = 0
         self._outbox: _Outbox | None = None
@@ -160,7 +162,13 @@ class _Frontend:
                     return
                 if self._is_thinned(frame):
                     continue
-                outputs = self._pipeline.push(frame)
+                try:
+                    outputs = self._pipeline.push(frame)
+                except (SourceError, SourceTruncatedError) as error:
+                    if not self._source.is_live:
+                        raise
+                    self._refuse(error)  # one bad message must not end a camera's session
+                    continue
                 self._publish(frame)
                 self._send(outputs)
                 self._report("working")
@@ -259,6 +267,12 @@ class _Frontend:
         if since is not None and self._context.config.frontend.disk_policy == "thin":
             self._thin_until_ns = self._newest_time_ns + round(1e9 * (time.monotonic() - since))
 
+    def _refuse(self, error: VggtMotionError) -> None:
+        self._unreadable_count += 1
+        if self._unreadable_count & (self._unreadable_count - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
+            _log.warning("frame refused", extra={"count": self._unreadable_count, "reason": str(error)})
+        self._report("working")
+
     def _is_thinned(self, frame: Frame) -> bool:
         """Whether a frame of a file goes by, as a camera's would have while the ledger had no space."""
         if self._thin_until_ns is not None and frame.capture_time_ns < self._thin_until_ns:
@@ -287,6 +301,7 @@ class _Frontend:
             linear_frames=pipeline.state_counts[MotionState.LINEAR],
             smoothing_delay_frames=delay,
             thinned_frames=self._thinned_count,
+            unreadable_frames=self._unreadable_count,
             **({} if self._outbox is None else self._outbox.counters()),
             **({} if rate_hz is None else {"smoothing_delay_s": delay / rate_hz}),
             **losses_of(self._source),
