@@ -60,7 +60,7 @@ def remeasure(
     )
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _sample(image, u, v):  # type: ignore[no-untyped-def]
     x, y = int(u), int(v)
     s, t = u - x, v - y
@@ -69,7 +69,7 @@ def _sample(image, u, v):  # type: ignore[no-untyped-def]
     return top + t * (bottom - top)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _place(rotation, translation, shared, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel relative to the middle of the image, and depth, of a point."""
     px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
@@ -82,7 +82,7 @@ def _place(rotation, translation, shared, x, y, z):  # type: ignore[no-untyped-d
     return factor * a + shared[2], factor * b + shared[3], pz
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def measure(rotations, translations, points, shared, start, frame, pixel, registered, images, usable):  # type: ignore[no-untyped-def]
     """Observations (point, frame, pixel) of every point that two frames see, in the order of points and frames."""
     count = len(start) - 1
@@ -215,7 +215,7 @@ def measure(rotations, translations, points, shared, start, frame, pixel, regist
     return out_point[:used], out_frame[:used], out_pixel[:used]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _camera_point(rotation, translation, point):  # type: ignore[no-untyped-def]
     x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
     y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
@@ -223,7 +223,7 @@ def _camera_point(rotation, translation, point):  # type: ignore[no-untyped-def]
     return x, y, z
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _world_point(rotation, translation, x, y, z):  # type: ignore[no-untyped-def]
     dx, dy, dz = x - translation[0], y - translation[1], z - translation[2]
     return (

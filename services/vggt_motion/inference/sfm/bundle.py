@@ -248,7 +248,7 @@ def _cost(
     return float(data) + float((information * (shared - mean) ** 2).sum())
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _data_cost(rotations, translations, points, shared, start, frame, pixel, robust_px):  # type: ignore[no-untyped-def]
     focal, k1 = math.exp(shared[0]), shared[1]
     width = robust_px * robust_px
@@ -270,7 +270,7 @@ def _data_cost(rotations, translations, points, shared, start, frame, pixel, rob
     return cost
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reduce(  # type: ignore[no-untyped-def]
     rotations,
     translations,
@@ -462,7 +462,7 @@ def _reduce(  # type: ignore[no-untyped-def]
     return system, right, elimination, point_step
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _inverse3(m):  # type: ignore[no-untyped-def]
     out = np.empty((3, 3))
     out[0, 0] = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
@@ -478,7 +478,7 @@ def _inverse3(m):  # type: ignore[no-untyped-def]
     return out / determinant
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve_positive(system, right):  # type: ignore[no-untyped-def]
     """Cholesky solution of a symmetric positive definite system, and whether it is one."""
     size = len(right)
@@ -506,7 +506,7 @@ def solve_positive(system, right):  # type: ignore[no-untyped-def]
     return True, solution
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _back_substitute(  # type: ignore[no-untyped-def]
     points, step, start, frame, elimination, point_step, axis, centre, slot
 ):
@@ -536,7 +536,7 @@ def _back_substitute(  # type: ignore[no-untyped-def]
     return moved
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def rotation_of(x, y, z):  # type: ignore[no-untyped-def]
     """Rotation matrix (3, 3) of a rotation vector in radians (Rodrigues)."""
     angle = math.sqrt(x * x + y * y + z * z)
@@ -551,7 +551,7 @@ def rotation_of(x, y, z):  # type: ignore[no-untyped-def]
     return turn
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _move_cameras(rotations, translations, step, axis, origin, slot):  # type: ignore[no-untyped-def]
     moved_rotations, moved_translations = rotations.copy(), translations.copy()
     stretch = math.exp(step[len(step) - _SHARED]) - 1.0

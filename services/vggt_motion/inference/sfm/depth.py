@@ -191,7 +191,7 @@ def _hypotheses(views: Sequence[stereo.View], sparse: SparseDepth, intrinsics: I
     return int(min(max(wanted, _MIN_HYPOTHESES), _MAX_HYPOTHESES))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def agreement(inverse_depth, sigma, other_inverse_depth, other_sigma, other_from_this, rays, camera, tolerance):  # type: ignore[no-untyped-def]
     """1 where the other frame's depth of the same surface agrees (H, W), else 0."""
     height, width = inverse_depth.shape

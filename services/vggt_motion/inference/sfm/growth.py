@@ -272,7 +272,7 @@ def _step_length(turned: Array, direction: Array, rays: Array, points: Array) ->
     return float(np.median(lengths))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def refine_pose(rotation, translation, points, pixels, shared):  # type: ignore[no-untyped-def]
     """Pose of one camera from known points, by iteratively re-weighted Gauss-Newton with a narrowing Cauchy kernel.
 

@@ -13,7 +13,8 @@ from vggt_motion.geometry.se3 import nearest_rotation
 Array = npt.NDArray[np.float64]
 Pair = tuple[int, int]
 
-_FOCAL_GRID = np.geomspace(0.4, 3.0, 15)  # focal length / image width, from a wide action camera to a small tele lens
+_FOCAL_GRID = (0.9, 0.4, 0.6, 1.3, 2.0, 3.0)  # focal length / image width, the likeliest first
+_HOPELESS_PX = 10.0  # no other focal length brings such residuals down to nothing
 _ITERATIONS = 8
 _MIN_MATCHES = 12
 
@@ -60,7 +61,7 @@ def fit_rotations(
         None where the frames are not connected.
     """
     usable = {pair: points for pair, points in matched.items() if len(points[0]) >= _MIN_MATCHES}
-    focals = [focal_px] if focal_px is not None else [float(value) * width_px for value in _FOCAL_GRID]
+    focals = [focal_px] if focal_px is not None else [value * width_px for value in _FOCAL_GRID]
     best: RotationFit | None = None
     for focal in focals:
         fits = {pair: fit_rotation(points[0], points[1], focal) for pair, points in usable.items()}
@@ -71,6 +72,8 @@ def fit_rotations(
         residual = float(np.percentile(medians, 75)) if medians else 0.0
         if best is None or residual < best.residual_px:
             best = RotationFit(rotations, focal, residual)
+        if residual > _HOPELESS_PX:
+            break
     return best
 
 

@@ -27,7 +27,7 @@ _NOISE_VARIANCE = 6.0  # grey levels squared, added to the variance of a window:
 _SMALL_STEP_PENALTY = 0.08
 _LARGE_STEP_PENALTY = 0.5
 _UNSEEN_COST = 1.0  # of a hypothesis that no neighbour sees
-_FINE_OFFSETS = (1.0, 0.5)  # in coarse steps: first over two on each side, then over one
+_FINE = ((2, 0.5), (1, 0.25))  # hypotheses on each side, and their spacing in coarse steps
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,11 @@ def match(
     camera = _camera(intrinsics)
     correlation = np.empty_like(reference)
     curvature = np.empty_like(reference)
-    for offset in _FINE_OFFSETS:
+    for reach, spacing in _FINE:
         level, correlation, curvature = refine(
-            reference, sources, rotations, translations, rays, camera, level, np.float32(step), np.float32(offset)
-        )
+            reference, sources, rotations, translations, rays, camera, level, np.float32(step), reach,
+            np.float32(spacing),
+        )  # fmt: skip
     travel = travel_of(rotations, translations, rays, camera, level * np.float32(step), height, width)
     # curvature was per square step: a step moves the match by travel times its share of the inverse depth
     per_step = travel / np.maximum(level, 0.25)
@@ -109,7 +110,7 @@ def _enlarged(level: Map, width: int, height: int) -> Map:
     return np.asarray(np.where(np.abs(near - smooth) < 1.0, smooth, near), dtype=np.float32)
 
 
-@numba.njit(cache=True, fastmath=False, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _seen_at(rotation, translation, camera, x, y, inverse_depth):  # type: ignore[no-untyped-def]
     px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] + inverse_depth * translation[0]
     py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] + inverse_depth * translation[1]
@@ -121,24 +122,52 @@ def _seen_at(rotation, translation, camera, x, y, inverse_depth):  # type: ignor
     return camera[0] * a * factor + camera[2], camera[1] * b * factor + camera[3]
 
 
-@numba.njit(cache=True)
-def _warp(source, rotation, translation, camera, rays, inverse_depth, warped, inside):  # type: ignore[no-untyped-def]
-    """Bilinear samples of ``source`` where each pixel with its inverse depth is seen, border repeated."""
-    height, width = source.shape
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turned(rotation, rays, out):  # type: ignore[no-untyped-def]
+    """Rays (H, W, 2) in another camera, as planes (3, H, W)."""
+    height, width, _ = rays.shape
     for i in range(height):
         for j in range(width):
-            u, v = _seen_at(rotation, translation, camera, rays[i, j, 0], rays[i, j, 1], inverse_depth[i, j])
-            inside[i, j] = u >= -0.5 and v >= -0.5 and u <= width - 0.5 and v <= height - 0.5
-            u = min(max(u, np.float32(0.0)), np.float32(width - 1.001))
-            v = min(max(v, np.float32(0.0)), np.float32(height - 1.001))
-            x, y = int(u), int(v)
-            s, t = u - x, v - y
-            top = source[y, x] + s * (source[y, x + 1] - source[y, x])
-            bottom = source[y + 1, x] + s * (source[y + 1, x + 1] - source[y + 1, x])
+            x, y = rays[i, j, 0], rays[i, j, 1]
+            for k in range(3):
+                out[k, i, j] = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _warp(source, turned, translation, camera, inverse_depth, columns, rows, warped, inside):  # type: ignore[no-untyped-def]
+    """Bilinear samples of ``source`` where each pixel with its inverse depth is seen, border repeated.
+
+    The coordinates of a row are computed apart from the samples: that loop then runs on several pixels at once.
+    """
+    height, width = source.shape
+    tx, ty, tz = translation[0], translation[1], translation[2]
+    fx, fy, cx, cy, k1 = camera[0], camera[1], camera[2], camera[3], camera[4]
+    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    last_u, last_v = np.float32(width - 1.001), np.float32(height - 1.001)
+    end_u, end_v = np.float32(width) - half, np.float32(height) - half
+    for i in range(height):
+        for j in range(width):
+            w = inverse_depth[i, j]
+            pz = turned[2, i, j] + w * tz
+            front = pz > np.float32(0.05)
+            scale = one / (pz if front else one)
+            a, b = (turned[0, i, j] + w * tx) * scale, (turned[1, i, j] + w * ty) * scale
+            factor = one + k1 * (a * a + b * b)
+            u, v = fx * a * factor + cx, fy * b * factor + cy
+            inside[i, j] = front and u >= -half and v >= -half and u <= end_u and v <= end_v
+            columns[j] = min(max(u, zero), last_u)
+            rows[j] = min(max(v, zero), last_v)
+        for j in range(width):
+            u, v = columns[j], rows[j]
+            x, y = np.int32(u), np.int32(v)
+            s, t = u - np.float32(x), v - np.float32(y)
+            top, bottom = source[y, x], source[y + 1, x]
+            top += s * (source[y, x + 1] - top)
+            bottom += s * (source[y + 1, x + 1] - bottom)
             warped[i, j] = top + t * (bottom - top)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _box(values, horizontal, out):  # type: ignore[no-untyped-def]
     """Mean over the window, with the border repeated."""
     height, width = values.shape
@@ -159,7 +188,7 @@ def _box(values, horizontal, out):  # type: ignore[no-untyped-def]
             out[i, j] = total * scale
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _correlate(reference, mean, deviation, warped, inside, work, out):  # type: ignore[no-untyped-def]
     """Windowed correlation of two images; -1 where the pixel is not inside."""
     height, width = reference.shape
@@ -184,7 +213,7 @@ def _correlate(reference, mean, deviation, warped, inside, work, out):  # type: 
                 out[i, j] = np.float32(-1.0)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _window_statistics(reference, work):  # type: ignore[no-untyped-def]
     height, width = reference.shape
     mean, square = np.empty_like(reference), np.empty_like(reference)
@@ -200,7 +229,7 @@ def _window_statistics(reference, work):  # type: ignore[no-untyped-def]
     return mean, square
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _better_half(values, count):  # type: ignore[no-untyped-def]
     """Mean of the better half of the neighbours that see the pixel: the others may be occluded. -1 without any."""
     kept = 0
@@ -222,7 +251,7 @@ def _better_half(values, count):  # type: ignore[no-untyped-def]
     return total / np.float32(half)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def sweep_cost(reference, sources, rotations, translations, rays, camera, inverse_depths):  # type: ignore[no-untyped-def]
     """Cost volume (H, W, D) float32: one minus the correlation of the better half of the neighbours."""
     count = len(sources)
@@ -237,10 +266,14 @@ def sweep_cost(reference, sources, rotations, translations, rays, camera, invers
     scores = np.empty((count, height, width), dtype=np.float32)
     volume = np.empty((height, width, depths), dtype=np.float32)
     values = np.empty(count, dtype=np.float32)
+    turned = np.empty((count, 3, height, width), dtype=np.float32)
+    for n in range(count):
+        _turned(rotations32[n], rays, turned[n])
+    columns, rows = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     for d in range(depths):
         plane[:] = np.float32(inverse_depths[d])
         for n in range(count):
-            _warp(sources[n], rotations32[n], translations32[n], camera, rays, plane, warped, inside)
+            _warp(sources[n], turned[n], translations32[n], camera, plane, columns, rows, warped, inside)
             _correlate(reference, mean, deviation, warped, inside, work, scores[n])
         for i in range(height):
             for j in range(width):
@@ -251,7 +284,7 @@ def sweep_cost(reference, sources, rotations, translations, rays, camera, invers
     return volume
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def semi_global(cost, small_penalty, large_penalty):  # type: ignore[no-untyped-def]
     """Costs (H, W, D) summed along paths from the left, right, top and bottom (Hirschmueller 2008, eq. 13)."""
     height, width, depths = cost.shape
@@ -285,7 +318,7 @@ def semi_global(cost, small_penalty, large_penalty):  # type: ignore[no-untyped-
     return total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def winner(total):  # type: ignore[no-untyped-def]
     """Cheapest hypothesis (H, W) float32 of a volume (H, W, D), interpolated by a parabola."""
     height, width, depths = total.shape
@@ -306,9 +339,11 @@ def winner(total):  # type: ignore[no-untyped-def]
     return level
 
 
-@numba.njit(cache=True)
-def refine(reference, sources, rotations, translations, rays, camera, level, step, offset):  # type: ignore[no-untyped-def]
-    """Best of five depth maps around ``level`` (in steps of inverse depth), ``offset`` apart, by a parabola.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def refine(  # type: ignore[no-untyped-def]
+    reference, sources, rotations, translations, rays, camera, level, step, reach, spacing
+):
+    """Best of ``2 * reach + 1`` depth maps around ``level`` (in steps of inverse depth), ``spacing`` apart.
 
     Returns the new level (H, W), its correlation (H, W) and the curvature of the correlation per square step (H, W).
     """
@@ -321,14 +356,18 @@ def refine(reference, sources, rotations, translations, rays, camera, level, ste
     warped = np.empty((height, width), dtype=np.float32)
     inside = np.empty((height, width), dtype=np.bool_)
     scores = np.empty((count, height, width), dtype=np.float32)
-    combined = np.empty((5, height, width), dtype=np.float32)
+    combined = np.empty((2 * reach + 1, height, width), dtype=np.float32)
     values = np.empty(count, dtype=np.float32)
-    for k in range(5):
+    turned = np.empty((count, 3, height, width), dtype=np.float32)
+    for n in range(count):
+        _turned(rotations32[n], rays, turned[n])
+    columns, rows = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    for k in range(2 * reach + 1):
         for i in range(height):
             for j in range(width):
-                inverse_depth[i, j] = max(level[i, j] + (k - 2) * np.float32(0.5) * offset, np.float32(0.0)) * step
+                inverse_depth[i, j] = max(level[i, j] + (k - reach) * spacing, np.float32(0.0)) * step
         for n in range(count):
-            _warp(sources[n], rotations32[n], translations32[n], camera, rays, inverse_depth, warped, inside)
+            _warp(sources[n], turned[n], translations32[n], camera, inverse_depth, columns, rows, warped, inside)
             _correlate(reference, mean, deviation, warped, inside, work, scores[n])
         for i in range(height):
             for j in range(width):
@@ -338,26 +377,25 @@ def refine(reference, sources, rotations, translations, rays, camera, level, ste
     out = np.empty_like(level)
     correlation = np.empty_like(level)
     curvature = np.zeros_like(level)
-    spacing = np.float32(0.5) * offset
     for i in range(height):
         for j in range(width):
-            best = 2
-            for k in range(5):
+            best = reach
+            for k in range(2 * reach + 1):
                 if combined[k, i, j] > combined[best, i, j]:
                     best = k
-            middle = min(max(best, 1), 3)
+            middle = min(max(best, 1), 2 * reach - 1)
             below, top, above = combined[middle - 1, i, j], combined[middle, i, j], combined[middle + 1, i, j]
             bend = 2 * top - below - above
             shift = np.float32(best - middle)
             if best == middle and bend > np.float32(1e-6):
                 shift = min(max(np.float32(0.5) * (above - below) / bend, np.float32(-0.5)), np.float32(0.5))
-            out[i, j] = max(level[i, j] + (middle - 2 + shift) * spacing, np.float32(0.0))
+            out[i, j] = max(level[i, j] + (middle - reach + shift) * spacing, np.float32(0.0))
             correlation[i, j] = combined[best, i, j]
             curvature[i, j] = max(bend, np.float32(0.0)) / (spacing * spacing)
     return out, correlation, curvature
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def travel_of(rotations, translations, rays, camera, inverse_depth, height, width):  # type: ignore[no-untyped-def]
     """Movement in pixels of each match per relative change of its depth (H, W), in the neighbour that shows it best."""
     rotations32, translations32 = rotations.astype(np.float32), translations.astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 _ITERATIONS = 6
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def triangulate(rotations, translations, rays, start, frame, robust_angle):  # type: ignore[no-untyped-def]
     """Points (P, 3) nearest to their rays in angle, by re-weighted least squares with a Cauchy kernel, and a flag (P,).
 
