@@ -360,7 +360,8 @@ def test_a_live_camera_loses_no_keyframe_while_the_ledger_is_down(services: Serv
 
         # The last frames wait for the look-ahead.
         wait_until(lambda: len(stored()) >= len(wanted) - 6, 60.0)
-        assert stored() == wanted[: len(stored())]
+        found = stored()  # once: the next look may find one more
+        assert found == wanted[: len(found)]
         report = watch.wait_for_report("frontend", 5.0)
     assert report is not None
     assert spooled > 3 and report.counters["spool_full_waits"] == 0
