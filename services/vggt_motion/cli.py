@@ -13,7 +13,7 @@ from rich.console import Console
 
 from vggt_motion import __version__
 from vggt_motion.config import load_config
-from vggt_motion.errors import InputError, VggtMotionError
+from vggt_motion.errors import InputError, SourceTruncatedError, VggtMotionError
 
 app = typer.Typer(
     name="vggt-motion",
@@ -190,6 +190,29 @@ def evaluate(
 
     errors = summary.evaluate_files(estimate, ground_truth, max_difference_s=max_difference_s)
     sys.stdout.write(summary.to_json(errors) if as_json else summary.to_text(errors))
+
+
+@app.command()
+def inspect(
+    source: Annotated[str, typer.Argument(help="As for run.")],
+    out: Annotated[Path, typer.Option(help="Folder for inspect.png, inspect.html and inspect.csv.")] = Path("inspect"),
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame to use.")] = 0,
+    end: Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")] = None,
+    stride: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
+) -> None:
+    """Show what the frontend sees: scores over time, motion states, keyframes and submap borders."""
+    from vggt_motion.evaluation import inspect as inspection
+
+    found = inspection.inspect(
+        source, load_config(config, list(assignments or ())), out, start=start, end=end, stride=stride
+    )
+    console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
+    console.print(f"{out}: inspect.png, inspect.html, inspect.csv")
+    if found.truncated:
+        console.print(f"The input ended early: {found.truncated}")
+        raise typer.Exit(SourceTruncatedError.exit_code)
 
 
 @app.command()

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from vggt_motion.backend.state import LogState
+from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus, open_bus
@@ -33,6 +34,7 @@ _TICK_S = 0.05
 _STATUS_INTERVAL_S = 0.5
 _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
+_REST_TIMEOUT_S = 5.0
 _RECORDER_QUIET_S = 2.0  # no frame for so long: those that are missing went by while no recorder was there
 _LOG_PATIENCE_S = 5.0  # what the frontend appended last is seen here after this at the latest
 CONFIG_FILE = "config.yaml"
@@ -320,6 +322,8 @@ class LocalRun:
                         _log.warning("the recorder did not catch up in time; the recording may lack its end")
                         break
                 time.sleep(_TICK_S)
+            if self._interrupts:
+                _take_in_rest(follower, state, LedgerClient(bus))
             on_progress(self._progress(state, watch))
         finally:
             follower.close()
@@ -377,6 +381,22 @@ class _RecorderProgress:
             return False
         _log.warning("frames are missing in the recording", extra={"missing": wanted - int(frame_count)})
         return True
+
+
+def _take_in_rest(follower: LogFollower, state: LogState, ledger: LedgerClient) -> None:
+    """Fold what the ledger has acknowledged up to now, so that an interrupted run shows all that was done."""
+    end = time.monotonic() + _REST_TIMEOUT_S
+    try:
+        wanted = {entry.stream: entry.next_sequence for entry in ledger.status().positions}
+    except BusError as error:
+        _log.warning("the ledger did not answer any more; its last records may be missing: %s", error)
+        return
+    while time.monotonic() < end:
+        for record in follower.poll():
+            state.apply(record)
+        if all(wanted.get(stream.value, 0) <= position for stream, position in follower.positions().items()):
+            return
+        time.sleep(_TICK_S)
 
 
 def _newest(watch: ServiceWatch, service: str) -> HealthReport | None:
