@@ -18,6 +18,7 @@ from vggt_motion.geometry.sim3 import Sim3
 
 SUBMAPS_PER_SEGMENT = 2  # one, or two halves
 
+
 class Stream(StrEnum):
     """The streams of the log (DESIGN section 4)."""
 

@@ -154,7 +154,7 @@ def test_a_finished_run_prints_its_summary_again(finished: tuple[Path, Any], sam
 def test_a_folder_of_another_run_is_refused(finished: tuple[Path, Any], sample: Path) -> None:
     out, _ = finished
     done = run(sample, out, "--stride", "2")
-    assert_one_clear_line(done, 2, str(out), "another configuration", "--fresh")
+    assert_one_clear_line(done, 2, str(out), "another source", "--fresh")
 
 
 def test_ctrl_c_keeps_what_was_done_and_the_next_run_continues(
@@ -226,7 +226,7 @@ def test_a_size_change_ends_the_input_there(frames: Path, tmp_path: Path) -> Non
 
 
 def test_an_unwritable_folder(frames: Path) -> None:
-    assert_one_clear_line(run(frames, Path("/proc/nowhere")), 2, "cannot write", "/proc/nowhere")
+    assert_one_clear_line(run(frames, Path("/proc/nowhere")), 2, "cannot create", "/proc/nowhere")
 
 
 def test_a_taken_port(frames: Path, tmp_path: Path) -> None:
