@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vggt_motion.backend import posegraph
+from vggt_motion.backend import factors
 from vggt_motion.geometry import se3, sim3
 from vggt_motion.geometry.sim3 import Sim3
 
@@ -89,19 +89,19 @@ def test_adjoint_carries_a_perturbation_across(a: np.ndarray, b: np.ndarray) -> 
 @given(tangents)
 def test_tangent_coordinates_are_those_of_gtsam(a: np.ndarray) -> None:
     theirs = gtsam.Similarity3.Expmap(a)
-    assert_same(sim3.exp(a), posegraph.from_gtsam(theirs))
-    np.testing.assert_allclose(gtsam.Similarity3.Logmap(posegraph.to_gtsam(sim3.exp(a))), a, atol=1e-6)
+    assert_same(sim3.exp(a), factors.from_gtsam(theirs))
+    np.testing.assert_allclose(gtsam.Similarity3.Logmap(factors.to_gtsam(sim3.exp(a))), a, atol=1e-6)
 
 
 @given(tangents, point_arrays)
 def test_conversion_to_gtsam_keeps_the_action(a: np.ndarray, points: np.ndarray) -> None:
     x = sim3.exp(a)
-    theirs = posegraph.to_gtsam(x)
+    theirs = factors.to_gtsam(x)
     for point in points:
         np.testing.assert_allclose(
             theirs.transformFrom(point), x.act(point), atol=1e-8 * max(1.0, np.abs(x.matrix()).max() * 20)
         )
-    assert_same(posegraph.from_gtsam(theirs), x)
+    assert_same(factors.from_gtsam(theirs), x)
 
 
 def test_exp_and_log_next_to_zero() -> None:

@@ -78,19 +78,19 @@ class Sim3:
 
 # The integrand of _translation_factor is entire, so that Gauss-Legendre quadrature with this many nodes is exact to
 # rounding for rotations up to pi and scale factors between e^-10 and e^10, without the closed form's branches at zero.
-_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
-_NODES, _NODE_WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _NODE_WEIGHTS
+_LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(24)
+QUADRATURE_NODES, QUADRATURE_WEIGHTS = 0.5 * (_LEGENDRE_NODES + 1.0), 0.5 * _LEGENDRE_WEIGHTS  # on [0, 1]
 
 
 def _translation_factor(omega: Array, log_scale: float) -> Array:
     """``V = integral over [0, 1] of exp(tau * lambda) * exp(tau * skew(omega)) d tau``, (3, 3): translation = V @ u."""
     angle = float(np.linalg.norm(omega))
     k = se3.skew(omega)
-    weights = _NODE_WEIGHTS * np.exp(log_scale * _NODES)
+    weights = QUADRATURE_WEIGHTS * np.exp(log_scale * QUADRATURE_NODES)
     # sin(a tau)/a and (1 - cos(a tau))/a^2 = (sin(a tau/2)/(a/2))^2 / 2, both regular at a = 0;
     # np.sinc(x) is sin(pi x)/(pi x)
-    first = _NODES * np.sinc(angle * _NODES / np.pi)
-    second = 0.5 * (_NODES * np.sinc(0.5 * angle * _NODES / np.pi)) ** 2
+    first = QUADRATURE_NODES * np.sinc(angle * QUADRATURE_NODES / np.pi)
+    second = 0.5 * (QUADRATURE_NODES * np.sinc(0.5 * angle * QUADRATURE_NODES / np.pi)) ** 2
     return float(weights.sum()) * np.eye(3) + float(weights @ first) * k + float(weights @ second) * (k @ k)
 
 
