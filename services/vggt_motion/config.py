@@ -104,7 +104,7 @@ class FrontendConfig(Section):
         description="files, while the ledger has no space: read no further, or let frames go by",
     )
     parallax_px: float = Field(
-        5.5, gt=0, description="tau_palx: shift since the last keyframe without its common part (frontend/keyframes.py)"
+        6.3, gt=0, description="tau_palx: shift since the last keyframe without its common part (frontend/keyframes.py)"
     )
     uniform_stride: int = Field(3, ge=1, description="for selection = uniform")
     covisibility_ratio: float = Field(

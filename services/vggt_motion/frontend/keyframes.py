@@ -23,10 +23,10 @@ from vggt_motion.sources.source import Frame
 
 STOP_MAX_FRAMES = 10_000  # a longer stop gets a boundary in between, or a parked camera would fill the memory
 
-ROTATION_WEIGHT = 0.3  # a common shift of 18 px at the default threshold: 6 degrees with KITTI's lens
+ROTATION_WEIGHT = 0.3  # a common shift of 20 px at the default threshold: 6 degrees with KITTI's lens
 
 _STRIDE = 2  # every second cell in both directions: 480 points at 320x97, of which a median needs no more
-_RESEED_SHARE = 0.5  # of the tracked points; below it the rest no longer speaks for the image
+_RESEED_SHARE = 0.7  # of the points; with fewer left their middle is what few outliers say
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,16 @@ class ParallaxTracker:
     """Parallax against the last keyframe, Palx(I_t, I_last), beyond the reach of the flow method.
 
     A lattice of points is laid on the textured cells of the keyframe and carried along by the flow between consecutive
-    frames: that is small and thus reliable however far the keyframe is. When half of the points have left the image,
-        what was
-    reached is kept and new points are laid.
+    frames: that is small and thus reliable however far the keyframe is.
 
     The parallax is the median length of the points' displacements without their common shift, or ``ROTATION_WEIGHT``
     of the common shift, whichever is larger. The common shift is what rotation does to an image; it moves everything
     and tells nothing about depth. With the plain median a turn makes every frame a keyframe, with a baseline of 0.4 m
     on KITTI 00 where straight driving has 2 m; without the shift a camera that only rotates would never get one.
+
+    Points that have left the image are the near ones; they rank above those that are left. Without them the median
+    would come to a halt at what the horizon moves, as it did for a second on a motorway. When too many have left,
+    what was reached is kept and new points are laid.
     """
 
     def __init__(self, grid: CellGrid, shape: tuple[int, int]) -> None:
@@ -122,10 +124,9 @@ class ParallaxTracker:
         is_scene = ~fixed[row, column]
         self._seed_count -= len(is_scene) - int(np.count_nonzero(is_scene))
         positions = self._positions + np.asarray(step, np.float32)[:, 0]
-        inside = is_scene & ((positions >= 0) & (positions <= self._limit)).all(axis=1)
-        self._positions, self._seeds = positions[inside], self._seeds[inside]
+        stays = is_scene & ((positions >= 0) & (positions <= self._limit)).all(axis=1)
+        self._positions, self._seeds = positions[stays], self._seeds[stays]
         if len(self._positions) < _RESEED_SHARE * self._seed_count or self._seed_count <= 0:
-            # the median over those that are left is the best there is for this stretch
             self._reached_px, self._reached_share = self.parallax_px, self.covisible_share
             self._lay_points(usable)
 
@@ -136,7 +137,9 @@ class ParallaxTracker:
             return self._reached_px
         displacement = self._positions - self._seeds
         common_x, common_y = median(displacement[:, 0]), median(displacement[:, 1])
-        spread = median(np.hypot(displacement[:, 0] - common_x, displacement[:, 1] - common_y))
+        lengths = np.hypot(displacement[:, 0] - common_x, displacement[:, 1] - common_y)
+        middle = min(self._seed_count // 2, len(lengths) - 1)  # of all points, those that have left being the last
+        spread = float(np.partition(lengths, middle)[middle])
         return self._reached_px + max(spread, ROTATION_WEIGHT * math.hypot(common_x, common_y))
 
     @property
