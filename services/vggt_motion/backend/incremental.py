@@ -36,6 +36,7 @@ from vggt_motion.records import Constraint, ConstraintKind, EdgeReport, GraphUpd
 _LOG = logging.getLogger(__name__)
 
 _RELINEARISE_THRESHOLD = 1.0
+_BULK = 100  # constraints at once, after a restart say, are solved together
 _NEVER = 2**31 - 1  # relinearisation is asked for where there is a reason, not every so many updates
 
 
@@ -74,7 +75,7 @@ class LiveGraph:
             if constraint.record_id not in self._constraints:
                 self._constraints[constraint.record_id] = constraint
                 self._pending[constraint.record_id] = constraint
-        if is_stale:
+        if is_stale or len(self._pending) > _BULK:
             self._rebuild()
             return
         try:

@@ -1,9 +1,11 @@
 """Solve one connected graph and switch off the loops that disagree (DESIGN 3.6).
 
-False loops are the rule where streets look alike. Measured on simulated drives along KITTI roads with 10 to 50 %
-false loops (tests/benchmarks/bench_posegraph.py): under Huber alone, or graduated non-convexity, one false loop bends
-the whole drive; under Cauchy started from the chain the true loops pull it home and the false ones lose their hold.
-What is then farther off than any honest error is switched off, and the rest is solved under Huber.
+False loops are the rule where streets look alike. Measured on simulated drives along KITTI roads with 10, 30 and 50 %
+false loops (tests/benchmarks/bench_posegraph.py): Huber alone multiplies the error by 13 to 40; GTSAM's graduated
+non-convexity keeps it, except in 4 of 16 drives with half of the loops false, at the price of dozens of solves; Cauchy
+started from the chain keeps it in nearly all, since the true loops pull the drive home and the false ones lose their
+hold. What is then farther off than any honest error is switched off and the rest is solved under Huber: the error is
+that of the drive without the false loops.
 """
 
 from __future__ import annotations
