@@ -21,6 +21,7 @@ Index = npt.NDArray[np.int64]
 _MIN_DEPTH = 1e-6
 _BEHIND_PX = 50.0  # a point behind its camera costs as much as one that is seen so far off
 _DIMENSIONS_OF_CAMERA = 6  # rotation, translation
+_MAX_LOG_FOCAL_STEP = 0.3  # further off the linearisation says nothing, and the focal length may run away for good
 _ALIGNED = 0.97  # length of the mean of unit optical axes above which they look one way
 _SHARED = 4  # logarithm of the focal length, radial coefficient, principal point u and v
 
@@ -130,7 +131,7 @@ def adjust(
             robust_px, damping, free, mean, information, axis, centre, slot,
         )  # fmt: skip
         solvable, step = solve_positive(system, gradient)
-        if not solvable:
+        if not solvable or abs(step[-_SHARED]) > _MAX_LOG_FOCAL_STEP:
             damping *= 10.0
             if damping > 1e8:
                 break

@@ -23,7 +23,7 @@ from vggt_motion.inference.sfm.images import GreyImage
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_MAX_NEIGHBOURS = 4
+MAX_NEIGHBOURS = 4
 _REACH = 6  # keyframes to either side that are considered as neighbours
 _BEST_PARALLAX_PX = 8.0  # at the lattice: enough to see depth, little enough to look alike
 _PARALLAX_LOG_WIDTH = 0.9
@@ -143,7 +143,7 @@ def _neighbours(
         visible = float(moved.mean())
         score = visible * math.exp(-0.5 * (math.log(parallax / _BEST_PARALLAX_PX) / _PARALLAX_LOG_WIDTH) ** 2)
         scored.append((-score, abs(other - position), other))
-    return [other for _, _, other in sorted(scored)[:_MAX_NEIGHBOURS]]
+    return [other for _, _, other in sorted(scored)[:MAX_NEIGHBOURS]]
 
 
 def _parallax_px(

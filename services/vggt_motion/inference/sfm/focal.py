@@ -25,6 +25,7 @@ _UNRECTIFIED_K1_SIGMA = 0.3
 _UNKNOWN_STARTS = (0.65, 1.1, 1.8)  # focal length / image width to grow from where nothing is known
 _LAST_USUAL_START = 1.5
 _SURE_RELATIVE_SIGMA = 0.1
+_MIN_FOCAL_OVER_WIDTH, _MAX_FOCAL_OVER_WIDTH = 0.25, 8.0
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,11 @@ class CameraPrior:
             mean=(math.log(focal * width_px), self.radial_k1, 0.0, 0.0),
             sigma=(sigma, _UNRECTIFIED_K1_SIGMA if is_unrectified else _K1_SIGMA, principal, principal),
         )
+
+
+def is_plausible(focal_over_width: float) -> bool:
+    """Whether there are cameras with such a lens."""
+    return _MIN_FOCAL_OVER_WIDTH < focal_over_width < _MAX_FOCAL_OVER_WIDTH
 
 
 def relative_sigma(information: Array, calibration: Calibration) -> float:

@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-_EPIPOLAR_PX = 1.0
+_EPIPOLAR_PX = 0.5  # wider, and sideways motion passes for rotation
 _MIN_PAIR_POINTS = 12
 _MIN_RESECTION_POINTS = 10
 _MIN_RESECTION_INLIERS = 8
@@ -132,9 +132,15 @@ def _pair(observations: Observations, rays: Array, a: int, focal_px: float) -> _
         return None
     rays_a, rays_b = rays[rows_a], rays[rows_b]
     cv2.setRNGSeed(0)  # the generator is the library's own and remembers earlier calls
-    essential, mask = cv2.findEssentialMat(
-        rays_a, rays_b, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.999, threshold=_EPIPOLAR_PX / focal_px
-    )
+    threshold = _EPIPOLAR_PX / focal_px
+    try:
+        essential, mask = cv2.findEssentialMat(
+            rays_a, rays_b, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.999, threshold=threshold
+        )
+    except cv2.error:  # its local optimisation can end without a model, which it then asserts on
+        essential, mask = cv2.findEssentialMat(
+            rays_a, rays_b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=threshold
+        )
     if essential is None or essential.shape != (3, 3):
         return None
     agreeing = mask.ravel() > 0

@@ -14,7 +14,7 @@ from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics
 from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints
 from vggt_motion.inference.sfm import depth as dense
-from vggt_motion.inference.sfm import globalmap, images, rotation, structure, tracks, verdict
+from vggt_motion.inference.sfm import globalmap, images, relocate, rotation, structure, tracks, verdict
 from vggt_motion.inference.sfm.bundle import Scene
 from vggt_motion.inference.sfm.focal import CameraPrior
 from vggt_motion.inference.sfm.library import load_pycolmap
@@ -67,8 +67,9 @@ class _Submap:
 
     def predict(self) -> Prediction:
         # 1. which frames carry information of their own
-        originals = [p for p in range(len(self._keyframes)) if p not in self._hints.zero_motion_copies]
-        if len(self._keyframes) < 2:
+        others = {*self._hints.zero_motion_copies, *self._hints.loop_positions}
+        originals = [p for p in range(len(self._keyframes)) if p not in others]
+        if len(self._keyframes) < 2 or not originals:
             return self._failed("a submap needs at least two keyframes")
         if len({image.pixels.shape for image in self._keyframes}) != 1:
             return self._failed("the keyframes differ in size")
@@ -154,10 +155,28 @@ class _Submap:
         registered = sorted(poses)
         grey = {position: images.reduce_image(working.grey[position], width, height) for position in registered}
         usable = images.usable_pixels(self._hints.ego_mask, width, height)
-        maps = dense.dense_depth(grey, poses, _sparse(solved), intrinsics, usable)
+        sparse = _sparse(solved)
+        maps = dense.dense_depth(grey, poses, sparse, intrinsics, usable)
+        loops = [p for p in sorted(self._hints.loop_positions) if p not in self._hints.zero_motion_copies]
+        if loops:
+            located = relocate.locate(working, loops, poses, maps, _intrinsics(solved.scene, working), solved.scene)
+            self._attempts.extend(_loop_outcome(position, located.get(position)) for position in loops)
+            for loop, found in located.items():
+                grey[loop] = images.reduce_image(working.grey[loop], width, height)
+                poses[loop] = found.camera_from_submap
+                sparse[loop] = dense.SparseDepth(found.points_camera)
+                group = (loop, *found.neighbours[: dense.MAX_NEIGHBOURS])
+                nearby = dense.dense_depth(
+                    {p: grey[p] for p in group},
+                    {p: poses[p] for p in group},
+                    {p: sparse[p] for p in group},
+                    intrinsics,
+                    usable,
+                )
+                maps[loop] = nearby[loop]
         frames = []
         for position in range(len(self._keyframes)):
-            original = self._hints.zero_motion_copies.get(position, position)
+            original = self._original(position)
             if original in maps:
                 frames.append(
                     PredictedFrame(
@@ -170,13 +189,20 @@ class _Submap:
                 )
         return tuple(frames)
 
+    def _original(self, position: int) -> int:
+        """The keyframe whose pose a keyframe shares: itself, or the other end of a stop."""
+        copies = self._hints.zero_motion_copies
+        for _ in range(len(copies)):
+            position = copies.get(position, position)
+        return position
+
     def _quality(self, solved: structure.Structure, frame_count: int, working: images.WorkingImages) -> SubmapQuality:
         return SubmapQuality(
             registered_frame_count=frame_count,
             mean_reprojection_error_px=solved.reprojection_px,
             track_inlier_ratio=solved.explained,
             median_parallax_deg=solved.median_parallax_deg,
-            focal_over_width=solved.scene.focal_px / working.width_px,
+            focal_over_width=solved.focal_over_width,
             focal_relative_sigma=solved.focal_relative_sigma,
             radial_k1=solved.scene.radial_k1,
             attempts=tuple(self._attempts),
@@ -184,13 +210,18 @@ class _Submap:
 
     def _rotation_only(self, turned: rotation.RotationFit, working: images.WorkingImages) -> Prediction:
         width, height = images.fitted_size(working.width_px, working.height_px, self._config.sfm.depth_width_px)
-        over_width = self._hint.focal_over_width if self._hint is not None else turned.focal_px / working.width_px
+        if self._hint is not None:
+            over_width = self._hint.focal_over_width
+        else:
+            over_width = turned.focal_px / working.width_px if turned.shows_focal else _FALLBACK_FOCAL_OVER_WIDTH
         k1 = self._hint.radial_k1 if self._hint is not None else 0.0
         intrinsics = Intrinsics.centred(over_width * width, width, height, k1)
         nothing = np.zeros((height, width), dtype=np.float32)
         frames = []
         for position in range(len(self._keyframes)):
-            original = self._hints.zero_motion_copies.get(position, position)
+            original = self._original(position)
+            if original not in turned.camera_from_submap:
+                continue  # a loop keyframe: without depth it cannot be placed
             camera_from_submap = turned.camera_from_submap[original]
             frames.append(
                 PredictedFrame(position, nothing, nothing, intrinsics, se3.make(camera_from_submap.T, np.zeros(3)))
@@ -226,6 +257,12 @@ def _effective_hint(config: InferenceConfig, hint: FocalHint | None) -> FocalHin
     if config.focal_over_width is not None:
         return FocalHint(config.focal_over_width, 0.0, config.radial_k1 or 0.0, is_fixed=True)
     return hint
+
+
+def _loop_outcome(position: int, located: relocate.Located | None) -> str:
+    if located is None:
+        return f"loop keyframe {position}: not found again"
+    return f"loop keyframe {position}: found again, {located.inlier_share:.0%} of the matches agree"
 
 
 def _matched(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ Pair = tuple[int, int]
 
 _FOCAL_GRID = (0.9, 0.4, 0.6, 1.3, 2.0, 3.0)  # focal length / image width, the likeliest first
 _HOPELESS_PX = 10.0  # no other focal length brings such residuals down to nothing
+_TELLING_TURN_DEG = 10.0
 _ITERATIONS = 8
 _MIN_MATCHES = 12
 
@@ -25,7 +27,14 @@ class RotationFit:
 
     camera_from_submap: dict[int, Array]  # position -> (3, 3) rotation, chained over neighbours
     focal_px: float
-    residual_px: float  # upper quartile over the widest pairs of their median residual
+    residual_px: float  # upper quartile over the pairs of their median residual
+
+    @property
+    def shows_focal(self) -> bool:
+        """Whether the camera turned far enough for the focal length to mean anything."""
+        first = self.camera_from_submap[min(self.camera_from_submap)]
+        cosines = [0.5 * (np.trace(first.T @ rotation) - 1.0) for rotation in self.camera_from_submap.values()]
+        return bool(min(cosines) < math.cos(math.radians(_TELLING_TURN_DEG)))
 
 
 def fit_rotation(points_a: Array, points_b: Array, focal_px: float) -> tuple[Array, Array]:

@@ -44,6 +44,7 @@ class Structure:
     """A solved submap; pixels are those of the working images, relative to the middle of the image."""
 
     positions: tuple[int, ...]  # the frames of ``scene``, positions in the submap
+    width_px: int
     registered: npt.NDArray[np.bool_]  # (F,)
     scene: Scene
     observations: Observations  # the ones that fit
@@ -54,6 +55,11 @@ class Structure:
     cost: float  # capped robust cost of all observations, to compare solutions of the same tracks by
     weakest_share: float  # least share, over steps between frames, of the points followed over it that fit in both
     weakest_link: int  # least number, over steps, of points that carry the scale: seen on both sides, twice on one
+
+    @property
+    def focal_over_width(self) -> float:
+        """Focal length divided by the image width."""
+        return self.scene.focal_px / self.width_px
 
     def camera_from_submap(self) -> dict[int, Array]:
         """Position of each registered frame -> (4, 4)."""
@@ -88,28 +94,29 @@ def solve(
         if best is not None and _is_convincing(best) and (prior.is_sure or not is_usual):
             break
         solved = _from_start(observations, positions, width_px, prior, calibration, start)
-        attempts.append(f"grown from focal {start:.2f} widths: {_outcome(solved, width_px)}")
+        attempts.append(f"grown from focal {start:.2f} widths: {_outcome(solved)}")
         best = _better(best, solved)
-        if solved is None or not _is_worth_regrowing(solved, start, width_px, prior):
+        if solved is None or not _is_worth_regrowing(solved, start, prior):
             continue
-        moved = solved.scene.focal_px / width_px
+        moved = solved.focal_over_width
         again = _from_start(observations, positions, width_px, prior, calibration, moved)
-        attempts.append(f"grown from focal {moved:.2f} widths: {_outcome(again, width_px)}")
+        attempts.append(f"grown from focal {moved:.2f} widths: {_outcome(again)}")
         best = _better(best, again)
     if best is None:
         return None, attempts
     if not prior.is_fixed and best.registered.sum() > 2:
         wide = prior.calibration(width_px, is_unrectified=True)
-        distorted = _adjusted(observations, best.registered, positions, best.scene, wide)
+        distorted = _adjusted(observations, best.registered, positions, width_px, best.scene, wide)
+        contradicted = abs(best.scene.radial_k1 - prior.radial_k1) > 2.0 * calibration.sigma[1]
         if (
             distorted is not None
             and abs(distorted.scene.radial_k1) < _MAX_K1
-            and distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost
+            and (contradicted or distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost)
         ):
-            attempts.append(f"with strong distortion: {_outcome(distorted, width_px)}")
+            attempts.append(f"with strong distortion: {_outcome(distorted)}")
             best, calibration = distorted, wide
     polished = _polished(best, observations, [working.grey[p] for p in positions], working.usable, calibration)
-    attempts.append(f"measured again: {_outcome(polished, width_px)}")
+    attempts.append(f"measured again: {_outcome(polished)}")
     return _in_unit_steps(polished), attempts
 
 
@@ -123,11 +130,11 @@ def solve_from(
     nothing = np.zeros((0, 3))
     scene = Scene(poses[:, :3, :3].copy(), poses[:, :3, 3].copy(), nothing, placed.focal_px, prior.radial_k1)
     calibration = prior.calibration(working.width_px)
-    solved = _adjusted(observations, registered, positions, scene, calibration)
+    solved = _adjusted(observations, registered, positions, working.width_px, scene, calibration)
     if solved is not None:
         images = [working.grey[p] for p in positions]
         solved = _in_unit_steps(_polished(solved, observations, images, working.usable, calibration))
-    return solved, _outcome(solved, working.width_px)
+    return solved, _outcome(solved)
 
 
 def _observations(tracks: Tracks, positions: Sequence[int], working: WorkingImages) -> Observations:
@@ -158,7 +165,7 @@ def _polished(
         ).scene
         fitting = fits
     return replace(
-        _described(scene, fitting, observations, solved.registered, solved.positions, calibration),
+        _described(scene, fitting, observations, solved.registered, solved.positions, solved.width_px, calibration),
         explained=solved.explained,
         cost=solved.cost,
         weakest_share=solved.weakest_share,
@@ -173,11 +180,12 @@ def _is_convincing(solved: Structure) -> bool:
     return solved.explained > _GOOD_EXPLAINED and solved.reprojection_px < _GOOD_REPROJECTION_PX
 
 
-def _is_worth_regrowing(solved: Structure, start: float, width_px: int, prior: CameraPrior) -> bool:
+def _is_worth_regrowing(solved: Structure, start: float, prior: CameraPrior) -> bool:
     """Whether the focal length moved so far in a turn that the scene may have kept a bend from its start."""
     if prior.is_fixed or bundle.looks_one_way(solved.scene.rotations[solved.registered]):
         return False
-    return abs(math.log(solved.scene.focal_px / width_px / start)) > _REGROW_RELATIVE
+    moved = solved.focal_over_width
+    return focal.is_plausible(moved) and abs(math.log(moved / start)) > _REGROW_RELATIVE
 
 
 def _in_unit_steps(solved: Structure) -> Structure:
@@ -195,12 +203,12 @@ def _better(best: Structure | None, other: Structure | None) -> Structure | None
     return min(best, other, key=lambda solved: solved.cost)
 
 
-def _outcome(solved: Structure | None, width_px: int) -> str:
+def _outcome(solved: Structure | None) -> str:
     if solved is None:
         return "no structure"
     return (
         f"{int(solved.registered.sum())} keyframes, {solved.explained:.0%} of the observations fit to "
-        f"{solved.reprojection_px:.2f} px, focal {solved.scene.focal_px / width_px:.3f}"
+        f"{solved.reprojection_px:.2f} px, focal {solved.focal_over_width:.3f}"
     )
 
 
@@ -217,13 +225,14 @@ def _from_start(
     grown = growth.grow(observations, len(positions), camera, calibration)
     if grown is None:
         return None
-    return _adjusted(observations, grown.registered, positions, grown.scene, calibration)
+    return _adjusted(observations, grown.registered, positions, width_px, grown.scene, calibration)
 
 
 def _adjusted(
     observations: Observations,
     registered: npt.NDArray[np.bool_],
     positions: Sequence[int],
+    width_px: int,
     scene: Scene,
     calibration: Calibration,
 ) -> Structure | None:
@@ -236,7 +245,7 @@ def _adjusted(
         scene = bundle.adjust(
             scene, fitting, calibration, robust_px, focal.PIXEL_SIGMA, iterations, tolerance, fixed
         ).scene
-    return _described(scene, fitting, observations, registered, tuple(positions), calibration)
+    return _described(scene, fitting, observations, registered, tuple(positions), width_px, calibration)
 
 
 def _described(
@@ -245,19 +254,24 @@ def _described(
     observations: Observations,
     registered: npt.NDArray[np.bool_],
     positions: tuple[int, ...],
+    width_px: int,
     calibration: Calibration,
 ) -> Structure:
     residuals = np.linalg.norm(bundle.residuals(scene, fitting), axis=1)
+    still = residuals < _STAGES[-1][1]
+    if not still.all():
+        fitting, residuals = fitting.subset(still), residuals[still]
     everything = np.linalg.norm(bundle.residuals(scene, observations), axis=1)
     information = bundle.shared_information(scene, fitting, calibration, _STAGES[-1][0], int(np.argmax(registered)))
     weakest_share, weakest_link = _weakest(fitting, observations, registered)
     return Structure(
         positions=positions,
+        width_px=width_px,
         registered=registered,
         scene=scene,
         observations=fitting,
         explained=len(fitting.frame) / max(len(observations.frame), 1),
-        reprojection_px=float(residuals.mean()),
+        reprojection_px=float(residuals.mean()) if len(residuals) else math.inf,
         median_parallax_deg=_median_parallax_deg(scene, fitting),
         focal_relative_sigma=focal.relative_sigma(information, calibration),
         cost=float((np.minimum(everything, _CAPPED_PX) ** 2).sum()),

@@ -120,7 +120,10 @@ def _epipolar_inliers(at_a: Points, at_b: Points) -> npt.NDArray[np.bool_]:
     if len(at_a) < _MIN_EPIPOLAR_MATCHES:
         return np.zeros(len(at_a), dtype=np.bool_)
     cv2.setRNGSeed(0)  # the generator is the library's own and remembers earlier calls
-    _, mask = cv2.findFundamentalMat(at_a, at_b, cv2.USAC_ACCURATE, _EPIPOLAR_PX, 0.999, 2000)
+    try:
+        _, mask = cv2.findFundamentalMat(at_a, at_b, cv2.USAC_ACCURATE, _EPIPOLAR_PX, 0.999, 2000)
+    except cv2.error:  # its local optimisation can end without a model, which it then asserts on
+        _, mask = cv2.findFundamentalMat(at_a, at_b, cv2.FM_RANSAC, _EPIPOLAR_PX, 0.999, 2000)
     return np.zeros(len(at_a), dtype=np.bool_) if mask is None else np.asarray(mask.ravel() > 0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vggt_motion.inference.sfm import focal
 from vggt_motion.inference.sfm.structure import Structure
 from vggt_motion.records import SubmapVerdict
 
@@ -36,6 +37,8 @@ def judge(solved: Structure, keyframe_count: int) -> tuple[SubmapVerdict, str]:
     if solved.explained < least:
         return SubmapVerdict.FAILED, f"the best scene explains only {solved.explained:.0%} of the observations"
     reasons = []
+    if not focal.is_plausible(solved.focal_over_width):
+        reasons.append(f"the focal length came out as {solved.focal_over_width:.2f} image widths")
     if registered < _GOOD_REGISTERED * keyframe_count:
         reasons.append(f"only {registered} of {keyframe_count} keyframes registered")
     if solved.explained < _GOOD_EXPLAINED:
