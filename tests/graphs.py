@@ -13,7 +13,7 @@ from vggt_motion.records import Constraint, ConstraintKind, GraphUpdate, Registr
 
 # Errors per axis of an edge between two submaps of real drives against ground truth: radians, metres, logarithm of
 # scale.
-EDGE_SIGMA = np.array([0.004] * 3 + [0.18] * 3 + [0.02])
+EDGE_SIGMA = np.array([0.007] * 3 + [0.21] * 3 + [0.02])
 MIN_LOOP_GAP = 10  # submaps
 LOOP_RADIUS_M, FALSE_LOOP_DISTANCE_M = 8.0, 30.0
 

@@ -31,6 +31,15 @@ def test_batches_do_what_single_transforms_do(seed: int) -> None:
         np.testing.assert_allclose(inverted[n].matrix(), x.inverse().matrix(), atol=1e-8)
         np.testing.assert_allclose(adjoints[n], x.adjoint(), atol=1e-9)
         np.testing.assert_allclose(first[n].matrix(), (singles[2][0] @ y).matrix(), atol=1e-8)
+    logs = sim3_batch.log(left)
+    np.testing.assert_allclose(logs, [sim3.log(x) for x, _ in singles], atol=1e-8)
     again = Sim3Batch.of(composed.to_list())
     np.testing.assert_array_equal(again.translation, composed.translation)
     assert len(Sim3Batch.of([])) == 0
+
+
+def test_turns_next_to_pi_have_their_logarithm() -> None:
+    axis = np.array([0.6, -0.48, 0.64])
+    for angle in (np.pi - 1e-7, np.pi - 1e-3, 3.0):
+        tangent = np.concatenate([angle * axis, [1.0, 2.0, 3.0], [0.2]])
+        np.testing.assert_allclose(sim3_batch.log(sim3_batch.exp(tangent[None]))[0], tangent, atol=1e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,7 @@ from vggt_motion.records import (
     SubmapQuality,
     SubmapSpec,
     SubmapVerdict,
+    submap_index,
 )
 
 BLOB = BlobRef("0" * 64, 1, "image/png")
@@ -197,6 +200,9 @@ def test_a_camera_that_never_moved_has_identical_poses() -> None:
     trajectory = compose([keyframe(0), keyframe(9, copy_of=0)], segments, {}, graph({}))
     np.testing.assert_array_equal(trajectory.track().world_from_camera, np.broadcast_to(np.eye(4), (10, 4, 4)))
     assert trajectory.path_length() == 0.0
+    # an epoch without a submap is a component of its own, by the index that its first submap would have
+    later = compose([], [replace(segments[0], index=3)], {}, graph({}))
+    assert later.components == (submap_index(3),)
     assert compose([keyframe(0)], segments, {}, graph({}), known_distance_m=5.0).scale == 1.0
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -103,11 +103,12 @@ def optimise(
     for index, pose in start.items():
         insert_pose(values, index, pose, size)
     plain = []
-    for edge in edges:
-        noise = gaussian(edge, size)
-        plain.append(between(edge, noise, size))
-        graph.add(between(edge, robust(edge.loss, noise, size), size))
-    plain += [between(edge, gaussian(edge, size), size) for edge in only_scored]
+    scored = [*edges, *only_scored]
+    for position, (edge, noise) in enumerate(zip(scored, _gaussians(scored, size), strict=True)):
+        measured = _measured(edge, size)
+        plain.append(_between(edge, measured, noise, size))
+        if position < len(edges):
+            graph.add(_between(edge, measured, robust(edge.loss, noise, size), size))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_MAX_ITERATIONS)
     parameters.setRelativeErrorTol(relative_tolerance)
@@ -162,13 +163,21 @@ def gaussian(edge: Edge, size: int) -> gtsam.noiseModel.Base:
     Raises:
         OptimizationError: it is not positive definite.
     """
-    information = edge.information[:size, :size]
+    return _gaussians([edge], size)[0]
+
+
+def _gaussians(edges: Sequence[Edge], size: int) -> list[gtsam.noiseModel.Base]:
+    if not edges:
+        return []
+    information = np.array([edge.information[:size, :size] for edge in edges])
+    symmetric = 0.5 * (information + information.transpose(0, 2, 1))
     try:
-        # the upper Cholesky factor, which GTSAM takes as square-root information
-        root = np.linalg.cholesky(0.5 * (information + information.T)).T
+        # the upper Cholesky factor is what GTSAM takes as square-root information
+        roots = np.linalg.cholesky(symmetric).transpose(0, 2, 1)
     except np.linalg.LinAlgError as error:
-        raise OptimizationError(f"the information of {edge.edge_id} is not positive definite") from error
-    return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+        worst = min(zip(edges, symmetric, strict=True), key=lambda pair: float(np.linalg.eigvalsh(pair[1])[0]))[0]
+        raise OptimizationError(f"the information of {worst.edge_id} is not positive definite") from error
+    return [gtsam.noiseModel.Gaussian.SqrtInformation(root, False) for root in roots]
 
 
 def robust(loss: Loss, noise: gtsam.noiseModel.Base, size: int) -> gtsam.noiseModel.Base:
@@ -181,7 +190,15 @@ def robust(loss: Loss, noise: gtsam.noiseModel.Base, size: int) -> gtsam.noiseMo
 
 def between(edge: Edge, noise: gtsam.noiseModel.Base, size: int) -> gtsam.NonlinearFactor:
     """The factor of an edge under a noise model."""
+    return _between(edge, _measured(edge, size), noise, size)
+
+
+def _measured(edge: Edge, size: int) -> Any:
     i_from_j = edge.j_from_i.inverse()
+    return _pose3(i_from_j) if size == 6 else to_gtsam(i_from_j)
+
+
+def _between(edge: Edge, measured: Any, noise: gtsam.noiseModel.Base, size: int) -> gtsam.NonlinearFactor:
     if size == 6:
-        return gtsam.BetweenFactorPose3(edge.i, edge.j, _pose3(i_from_j), noise)
-    return gtsam.BetweenFactorSimilarity3(edge.i, edge.j, to_gtsam(i_from_j), noise)
+        return gtsam.BetweenFactorPose3(edge.i, edge.j, measured, noise)
+    return gtsam.BetweenFactorSimilarity3(edge.i, edge.j, measured, noise)

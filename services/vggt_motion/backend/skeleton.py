@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vggt_motion.backend.factors import Edge
-from vggt_motion.geometry import sim3, sim3_batch
+from vggt_motion.geometry import sim3_batch
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.geometry.sim3_batch import Sim3Batch
 
@@ -52,7 +52,7 @@ class Skeleton:
         for _ in range(_MAX_EXPANSIONS):
             reached = placed.take(self.kept[1:])
             missed = reached.inverse() @ ends.take(np.arange(1, len(ends)))
-            left = np.array([sim3.log(missed[n]) for n in range(len(missed))]).reshape(-1, 7)
+            left = sim3_batch.log(missed)
             steps = steps @ sim3_batch.exp(self._shares(placed, left)[1:])
             placed = self._compose(ends, steps)
         return dict(zip(self.members, placed.to_list(), strict=True)) | {

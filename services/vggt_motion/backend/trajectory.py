@@ -28,6 +28,7 @@ from vggt_motion.records import (
     Segment,
     SubmapGeometry,
     SubmapPose,
+    submap_index,
 )
 
 Array = npt.NDArray[np.float64]
@@ -123,7 +124,7 @@ def compose(
         _share(solved, copy, original)
     frames: list[TrajectoryPose] = []
     for (camera, epoch), entries in _streams(segments).items():
-        first = min(segment.index for segment in segments if (segment.camera, segment.epoch) == (camera, epoch))
+        first = submap_index(min(s.index for s in segments if (s.camera, s.epoch) == (camera, epoch)))
         known = {
             k.frame_index: solved[k.keyframe_id]
             for k in keyframes

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from vggt_motion.geometry import se3
 from vggt_motion.geometry.sim3 import QUADRATURE_NODES, QUADRATURE_WEIGHTS, Sim3
 
 Array = npt.NDArray[np.float64]
@@ -82,14 +83,49 @@ def exp(tangents: Array) -> Sim3Batch:
     k2 = k @ k
     first, second = _sine_terms(angle)
     rotation = np.eye(3) + first[:, None, None] * k + second[:, None, None] * k2
-    # the translation factor V, by the same quadrature as for a single transform
+    of_identity, of_skew, of_square = _translation_terms(omega, log_scale)
+    moved = of_identity[:, None] * u
+    moved += of_skew[:, None] * (k @ u[:, :, None])[:, :, 0]
+    moved += of_square[:, None] * (k2 @ u[:, :, None])[:, :, 0]
+    return Sim3Batch(rotation, moved, np.exp(log_scale))
+
+
+def log(transforms: Sim3Batch) -> Array:
+    """Logarithm map: tangents (N, 7), rotations of norm at most pi."""
+    omega = _rotation_log(transforms.rotation)
+    log_scale = np.log(transforms.scale)
+    weights, first, second = _translation_terms(omega, log_scale)
+    k = _skew(omega)
+    v = weights[:, None, None] * np.eye(3) + first[:, None, None] * k + second[:, None, None] * (k @ k)
+    u = np.linalg.solve(v, transforms.translation[:, :, None])[:, :, 0]
+    return np.concatenate([omega, u, log_scale[:, None]], axis=1)
+
+
+def _rotation_log(rotation: Array) -> Array:
+    """Rotation vectors (N, 3)."""
+    axis = 0.5 * np.stack(
+        [
+            rotation[:, 2, 1] - rotation[:, 1, 2],
+            rotation[:, 0, 2] - rotation[:, 2, 0],
+            rotation[:, 1, 0] - rotation[:, 0, 1],
+        ],
+        axis=1,
+    )
+    sine, cosine = np.linalg.norm(axis, axis=1), 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0)
+    angle = np.arctan2(sine, cosine)
+    out = axis / np.sinc(angle / np.pi)[:, None]
+    # next to pi the sine says nothing of the axis; such a turn is rare enough to be taken one by one
+    for n in np.flatnonzero(cosine < -0.9).tolist():
+        out[n] = se3.so3_log(rotation[n])
+    return np.asarray(out, dtype=np.float64)
+
+
+def _translation_terms(omega: Array, log_scale: Array) -> tuple[Array, Array, Array]:
+    """Factors (N,) of the identity, skew(omega) and its square in ``V``, by the quadrature of a single transform."""
     nodes = QUADRATURE_NODES
     weights = QUADRATURE_WEIGHTS * np.exp(log_scale[:, None] * nodes)
-    first_at, second_at = _sine_terms(angle[:, None] * nodes)
-    v = weights.sum(axis=1)[:, None] * u
-    v += (weights * nodes * first_at).sum(axis=1)[:, None] * np.einsum("nij,nj->ni", k, u)
-    v += (weights * nodes**2 * second_at).sum(axis=1)[:, None] * np.einsum("nij,nj->ni", k2, u)
-    return Sim3Batch(rotation, v, np.exp(log_scale))
+    first, second = _sine_terms(np.linalg.norm(omega, axis=1)[:, None] * nodes)
+    return weights.sum(axis=1), (weights * nodes * first).sum(axis=1), (weights * nodes**2 * second).sum(axis=1)
 
 
 def _sine_terms(angle: Array) -> tuple[Array, Array]:

@@ -44,7 +44,7 @@ _MAX_CAMERA_RESIDUAL = 0.1
 # However well its anchor fits, an edge between two submaps is no better than the submaps are rigid. Standard
 # deviations per axis (radians, typical depths, logarithm of scale) of adjacent edges against ground truth on KITTI
 # 00, 01 and 06.
-_SUBMAP_SIGMA = np.array([0.004] * 3 + [0.015] * 3 + [0.02])
+_SUBMAP_SIGMA = np.array([0.007] * 3 + [0.02] * 3 + [0.02])
 
 
 @dataclass(frozen=True)
