@@ -1,7 +1,7 @@
 """Solve one connected graph and switch off the loops that disagree (DESIGN 3.6).
 
 False loops are the rule where streets look alike. Measured on simulated drives along KITTI roads with 10, 30 and 50 %
-false loops (tests/benchmarks/bench_posegraph.py): Huber alone multiplies the error by 13 to 40; GTSAM's graduated
+false loops (tests/benchmarks/bench_posegraph.py): Huber alone multiplies the error by more than ten; GTSAM's graduated
 non-convexity keeps it, except in 4 of 16 drives with half of the loops false, at the price of dozens of solves; Cauchy
 started from the chain keeps it in nearly all, since the true loops pull the drive home and the false ones lose their
 hold. What is then farther off than any honest error is switched off and the rest is solved under Huber: the error is

@@ -42,8 +42,8 @@ _MAX_SIGMA = np.array([0.02] * 3 + [0.05] * 3 + [0.05])
 # Residual of a camera centre, in baselines, at which it still counts as an inlier when the cameras stand alone.
 _MAX_CAMERA_RESIDUAL = 0.1
 # However well its anchor fits, an edge between two submaps is no better than the submaps are rigid. Standard
-# deviations per axis (radians, typical depths, logarithm of scale) of adjacent edges against ground truth on KITTI
-# 00, 01 and 06.
+# deviations per axis (radians, typical depths, logarithm of scale) of adjacent edges of the predictor "sfm" against
+# ground truth on KITTI 00 and 06.
 _SUBMAP_SIGMA = np.array([0.007] * 3 + [0.02] * 3 + [0.02])
 
 
