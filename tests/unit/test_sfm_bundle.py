@@ -206,7 +206,7 @@ def test_resection_finds_the_camera_among_outliers() -> None:
     points, pixels = truth.points[observations.point[rows]], observations.pixel[rows].copy()
     pixels[::4] += np.array([30.0, -20.0])
     _, rotation, translation = growth.refine_pose(
-        truth.rotations[1].copy(), truth.translations[1].copy(), points, pixels, truth.shared
+        truth.rotations[1].copy(), truth.translations[1].copy(), points, pixels, truth.shared, growth.WIDE_TO_NARROW
     )
     np.testing.assert_allclose(rotation, truth.rotations[2], atol=1e-4)
     np.testing.assert_allclose(translation, truth.translations[2], atol=1e-3)

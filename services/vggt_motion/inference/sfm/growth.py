@@ -31,6 +31,12 @@ _MIN_RESECTION_POINTS = 10
 _MIN_RESECTION_INLIERS = 8
 _INLIER_PX = 3.0
 _SEED_CANDIDATES = 6
+_MAX_COST_RATIO = 3.0  # of poses of one frame that are weighed against each other
+_SAME_ROTATION_TRACE = 3.0 - math.radians(0.3) ** 2  # of relative rotations closer than 0.3 degrees
+_CAPPED_PX = 2.0
+# Kernels in pixels: from far away, where the motion is a guess; from nearby, or outliers would pull a good one off
+WIDE_TO_NARROW = np.array([16.0, 16.0, 16.0, 8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+_NARROW = np.array([2.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 _HELD = Calibration((False, False, False, False), (0.0, 0.0, 0.0, 0.0), (math.inf, math.inf, math.inf, math.inf))
 
 
@@ -214,24 +220,47 @@ def _place_next(growing: Grown, observations: Observations, pairs: dict[int, _Pa
                 candidates.append((len(rows), frame, near[0], rows))
     for _, frame, neighbour, rows in sorted(candidates, key=lambda entry: (-entry[0], entry[1])):
         points, pixels = scene.points[observations.point[rows]], observations.pixel[rows]
-        best: tuple[float, Array, Array] | None = None
-        for rotation, translation in _guesses(growing, pairs, frame, neighbour, rays[rows], points):
-            cost, rotation, translation = refine_pose(rotation, translation, points, pixels, scene.shared)
-            if best is None or cost < best[0]:
-                best = (cost, rotation, translation)
-        if best is None:
-            continue
-        rotations, translations = scene.rotations.copy(), scene.translations.copy()
-        rotations[frame], translations[frame] = best[1], best[2]
-        placed = replace(scene, rotations=rotations, translations=translations)
-        only = observations.subset(np.isin(np.arange(len(observations.frame)), rows))
-        if (np.linalg.norm(bundle.residuals(placed, only), axis=1) < _INLIER_PX).sum() < _MIN_RESECTION_INLIERS:
-            continue
+        placings = [
+            refine_pose(rotation, translation, points, pixels, scene.shared, widths)
+            for rotation, translation in _guesses(growing, pairs, frame, neighbour, rays[rows], points)
+            for widths in (WIDE_TO_NARROW, _NARROW)
+        ]
         more = registered.copy()
         more[frame] = True
-        scene, _ = retriangulate(placed, observations, more, 1.0, 6.0)
-        return Grown(scene, more)
+        placed = []
+        for _, rotation, translation in _distinct(placings):
+            rotations, translations = scene.rotations.copy(), scene.translations.copy()
+            rotations[frame], translations[frame] = rotation, translation
+            moved = replace(scene, rotations=rotations, translations=translations)
+            only = observations.subset(np.isin(np.arange(len(observations.frame)), rows))
+            if (np.linalg.norm(bundle.residuals(moved, only), axis=1) < _INLIER_PX).sum() >= _MIN_RESECTION_INLIERS:
+                placed.append(Grown(moved, more))
+        if len(placed) == 1:
+            scene, _ = retriangulate(placed[0].scene, observations, more, 1.0, 6.0)
+            return Grown(scene, more)
+        if placed:
+            # points that few frames have seen give way to a wrong pose: let all of them have their say
+            settled = [settle(one, observations, _HELD, iterations=8, robust_px=1.0) for one in placed]
+            return min(settled, key=lambda one: _misfit(one, observations))
     return None
+
+
+def _distinct(placings: list[tuple[float, Array, Array]]) -> list[tuple[float, Array, Array]]:
+    """Refined poses that differ in rotation, best first; those that fit far worse than the best are left out."""
+    kept: list[tuple[float, Array, Array]] = []
+    for placing in sorted(placings, key=lambda entry: entry[0]):
+        if kept and placing[0] > _MAX_COST_RATIO * kept[0][0]:
+            break
+        if all(np.trace(placing[1].T @ other[1]) < _SAME_ROTATION_TRACE for other in kept):
+            kept.append(placing)
+    return kept
+
+
+def _misfit(growing: Grown, observations: Observations) -> float:
+    """Mean capped square error of all that the registered frames see."""
+    seen = observations.subset(growing.registered[observations.frame])
+    errors = np.linalg.norm(bundle.residuals(growing.scene, seen), axis=1)
+    return float((np.minimum(errors, _CAPPED_PX) ** 2).mean())
 
 
 def _known_points(growing: Grown, observations: Observations) -> Mask:
@@ -279,14 +308,13 @@ def _step_length(turned: Array, direction: Array, rays: Array, points: Array) ->
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def refine_pose(rotation, translation, points, pixels, shared):  # type: ignore[no-untyped-def]
-    """Pose of one camera from known points, by iteratively re-weighted Gauss-Newton with a narrowing Cauchy kernel.
+def refine_pose(rotation, translation, points, pixels, shared, widths):  # type: ignore[no-untyped-def]
+    """Pose of one camera from known points, by iteratively re-weighted Gauss-Newton, a Cauchy kernel per iteration.
 
-    Returns the robust cost at the narrowest width, the rotation (3, 3) and the translation (3,).
+    Returns the robust cost at the last width, the rotation (3, 3) and the translation (3,).
     """
     focal, k1 = np.exp(shared[0]), shared[1]
     r, t = rotation.copy(), translation.copy()
-    widths = np.array([16.0, 16.0, 16.0, 8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 1.0, 1.0, 1.0])
     cost = 0.0
     for iteration in range(len(widths) + 1):
         width = widths[min(iteration, len(widths) - 1)] ** 2

@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 Pair = tuple[int, int]
 
 _MODEL = "sfm"
+_MAX_DISAGREEMENT = 0.03  # of the path, between solutions found in different ways
 _MIN_MATCHES = 12
 _MATCH_REACH = 4  # keyframes that are matched with each other at most so far apart
 _STILL_PX = 1.0  # matches that a rotation explains this well carry no parallax
@@ -96,13 +97,15 @@ class _Submap:
             return self._rotation_only(turned, working)
         # 4. structure
         started = time.perf_counter()
-        solved = self._solve(followed, originals, working)
+        solved, doubt = self._solve(followed, originals, working)
         self._seconds["structure_s"] = time.perf_counter() - started
         if solved is None:
             return self._failed("structure from motion found no scene that the keyframes agree on")
         judgement, reason = verdict.judge(solved, len(originals))
         if judgement is SubmapVerdict.FAILED:
             return self._failed(reason)
+        if doubt:
+            judgement, reason = SubmapVerdict.LOW_QUALITY, "; ".join(part for part in (reason, doubt) if part)
         # 5. depth
         started = time.perf_counter()
         frames = self._frames(solved, working)
@@ -111,36 +114,52 @@ class _Submap:
 
     def _solve(
         self, followed: tracks.Tracks, originals: Sequence[int], working: images.WorkingImages
-    ) -> structure.Structure | None:
-        """The structure; where the fast way leaves doubts, also by matched features, grown and mapped at once."""
-        prior = self._prior()
+    ) -> tuple[structure.Structure | None, str]:
+        """The structure, and what speaks against it beside its own quality.
+
+        Where the fast way leaves doubts, matched features are tried as well, grown and mapped all at once: ways that
+        have little in common but the images, so that their agreement means something.
+        """
+        prior, count = self._prior(), len(originals)
         solved, attempts = structure.solve(followed, originals, working, prior)
         self._attempts.extend(attempts)
-        if solved is not None and verdict.judge(solved, len(originals))[0] is SubmapVerdict.GOOD:
-            return solved
+        if solved is not None and verdict.is_convincing(solved, count):
+            return solved, ""
         candidates = [solved]
         matched = tracks.match(working, originals)
         again, attempts = structure.solve(matched, originals, working, prior)
         self._attempts.extend(f"matched features, {attempt}" for attempt in attempts)
         candidates.append(again)
-        if len(originals) > 2 and (again is None or verdict.judge(again, len(originals))[0] is not SubmapVerdict.GOOD):
-            known = prior.focal_over_width if prior.focal_over_width is not None else _FALLBACK_FOCAL_OVER_WIDTH
-            placed = globalmap.place(
-                matched,
-                originals,
-                working.width_px,
-                working.height_px,
-                known * working.width_px,
-                prior.is_sure,
-                self._config.sfm.seed,
-            )
-            mapped, outcome = None, "no model"
-            if placed is not None:
-                mapped, outcome = structure.solve_from(matched, originals, working, prior, placed)
-            self._attempts.append(f"matched features, global mapping: {outcome}")
-            candidates.append(mapped)
+        if count > 2 and (again is None or not verdict.is_convincing(again, count)):
+            candidates.append(self._mapped(matched, originals, working, prior))
         found = [candidate for candidate in candidates if candidate is not None]
-        return max(found, key=lambda candidate: verdict.rank(candidate, len(originals))) if found else None
+        if not found:
+            return None, ""
+        found.sort(key=lambda candidate: verdict.rank(candidate, count), reverse=True)
+        apart = min((verdict.disagreement(other, found[0]) for other in found[1:]), default=0.0)
+        if apart > _MAX_DISAGREEMENT and not verdict.is_convincing(found[0], count):
+            return found[0], f"ways to solve it disagree by {apart:.0%} of the path"
+        return found[0], ""
+
+    def _mapped(
+        self, matched: tracks.Tracks, originals: Sequence[int], working: images.WorkingImages, prior: CameraPrior
+    ) -> structure.Structure | None:
+        """The structure from poses of global mapping."""
+        known = prior.focal_over_width if prior.focal_over_width is not None else _FALLBACK_FOCAL_OVER_WIDTH
+        placed = globalmap.place(
+            matched,
+            originals,
+            working.width_px,
+            working.height_px,
+            known * working.width_px,
+            prior.is_sure,
+            self._config.sfm.seed,
+        )
+        mapped, outcome = None, "no model"
+        if placed is not None:
+            mapped, outcome = structure.solve_from(matched, originals, working, prior, placed)
+        self._attempts.append(f"matched features, global mapping: {outcome}")
+        return mapped
 
     def _prior(self) -> CameraPrior:
         hint = self._hint

@@ -137,7 +137,9 @@ def _resect(
     start = _errors(rotation, offset, points, centred, scene) < 2.0 * _RANSAC_PX
     if start.sum() < _MIN_INLIERS:
         return None
-    _, rotation, moved = growth.refine_pose(rotation, offset, points[start], centred[start], scene.shared)
+    _, rotation, moved = growth.refine_pose(
+        rotation, offset, points[start], centred[start], scene.shared, growth.WIDE_TO_NARROW
+    )
     inliers = _errors(rotation, moved, points, centred, scene) < _INLIER_PX
     if inliers.sum() < _MIN_INLIERS or inliers.mean() < _MIN_INLIER_SHARE:
         return None

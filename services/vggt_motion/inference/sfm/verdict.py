@@ -16,6 +16,8 @@ _GOOD_REPROJECTION_PX = 0.75
 _GOOD_REGISTERED = 0.8
 _GOOD_PARALLAX_DEG = 0.3
 _GOOD_FRAME_OBSERVATIONS = 15
+_CONVINCING_REPROJECTION_PX = 0.3
+_CONVINCING_EXPLAINED = 0.88
 _GOOD_SHARE = 0.4
 _GOOD_LINK = 25
 
@@ -57,8 +59,38 @@ def judge(solved: Structure, keyframe_count: int) -> tuple[SubmapVerdict, str]:
     return (SubmapVerdict.LOW_QUALITY if reasons else SubmapVerdict.GOOD), "; ".join(reasons)
 
 
+def is_convincing(solved: Structure, keyframe_count: int) -> bool:
+    """Whether it is so good that no other way need be tried.
+
+    A scene can be bent and still explain four fifths of the tracks, but it does so badly.
+    """
+    if judge(solved, keyframe_count)[0] is not SubmapVerdict.GOOD:
+        return False
+    return solved.reprojection_px < _CONVINCING_REPROJECTION_PX or solved.explained > _CONVINCING_EXPLAINED
+
+
 def rank(solved: Structure, keyframe_count: int) -> tuple[int, int, float]:
-    """Sorts solutions of the same keyframes: the verdict, then how many were registered, then how much is explained."""
+    """Sorts solutions of the same keyframes: the verdict, how many were registered, how much fits and how well."""
     order = (SubmapVerdict.FAILED, SubmapVerdict.LOW_QUALITY, SubmapVerdict.GOOD)
     judgement, _ = judge(solved, keyframe_count)
-    return order.index(judgement), int(solved.registered.sum()), solved.explained
+    sharpness = 1.0 / (1.0 + (solved.reprojection_px / _CONVINCING_REPROJECTION_PX) ** 2)
+    return order.index(judgement), int(solved.registered.sum()), solved.explained * sharpness
+
+
+def disagreement(one: Structure, other: Structure) -> float:
+    """How far apart two solutions put the cameras, after the best similarity, as a share of the path; 0 if too few."""
+    first, second = one.camera_from_submap(), other.camera_from_submap()
+    shared = sorted(set(first) & set(second))
+    if len(shared) < 3:
+        return 0.0
+    a, b = (np.stack([-poses[p][:3, :3].T @ poses[p][:3, 3] for p in shared]) for poses in (first, second))
+    length = float(np.linalg.norm(np.diff(b, axis=0), axis=1).sum())
+    centred_a, centred_b = a - a.mean(axis=0), b - b.mean(axis=0)
+    u, s, vt = np.linalg.svd(centred_b.T @ centred_a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    spread = float((centred_a**2).sum())
+    if length <= 0.0 or spread <= 0.0:
+        return 0.0
+    scale = float((s * signs).sum()) / spread
+    errors = np.linalg.norm(scale * centred_a @ (u * signs @ vt).T - centred_b, axis=1)
+    return float(np.sqrt((errors**2).mean())) / length
