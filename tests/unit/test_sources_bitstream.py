@@ -107,14 +107,36 @@ def test_a_video_of_one_size_runs_to_its_end(tmp_path: Path, fourcc: str, suffix
     assert error == "" and len(frames) == 20
 
 
-@given(st.sampled_from(["h264", "mpg2", "FMP4", "MJPG"]), st.binary(max_size=80), st.booleans())
+@pytest.mark.parametrize("name", ["hevc", "h264", "vp8.ivf", "vp9.ivf"])
+def test_streams_of_other_encoders_that_change_size_end_there(name: str) -> None:
+    """Six frames of 322x182, then six of 160x120, made with x265, x264 and libvpx."""
+    path = Path(__file__).resolve().parents[1] / "data" / "size_change" / f"size_change.{name}"
+    frames, error = _drain(path)
+    assert "changes size from 322x182 to 160x120 at frame 6" in error
+    assert len(frames) == 6
+    fourcc, packets = _packets(path)
+    reader = size_reader(fourcc)
+    assert reader is not None
+    announced = [reader(packet) for packet in packets]
+    assert [size for size in dict.fromkeys(announced) if size] == [(322, 182), (160, 120)]
+
+
+@given(st.sampled_from(["h264", "hevc", "VP80", "VP90", "mpg2", "FMP4", "MJPG"]), st.binary(max_size=80), st.booleans())
 def test_damaged_packets_never_raise(fourcc: str, data: bytes, with_start: bool) -> None:
     reader = size_reader(fourcc)
     assert reader is not None
-    prefix = {"h264": b"\0\0\1\x67", "mpg2": b"\0\0\1\xb3", "FMP4": b"\0\0\1\x20", "MJPG": b"\xff\xd8"}[fourcc]
+    prefix = {
+        "h264": b"\0\0\1\x67",
+        "hevc": b"\0\0\1\x42\x01",
+        "VP80": b"\0\0\0\x9d\x01\x2a",
+        "VP90": b"\x82\x49\x83\x42",
+        "mpg2": b"\0\0\1\xb3",
+        "FMP4": b"\0\0\1\x20",
+        "MJPG": b"\xff\xd8",
+    }[fourcc]
     size = reader(prefix + data if with_start else data)
     assert size is None or len(size) == 2
 
 
 def test_unknown_codecs_say_nothing() -> None:
-    assert size_reader("hev1") is None
+    assert size_reader("AV01") is None

@@ -1,8 +1,8 @@
 """The picture size that a coded video packet announces, without decoding it.
 
 OpenCV scales every frame of a video to the size of the first without a word; a change of size in mid-stream would thus
-change the camera unseen. So the packets are looked at beside the decoder. Known are H.264, MPEG-1/2, MPEG-4 part 2
-and Motion JPEG; packets of other codecs say nothing here.
+change the camera unseen. So the packets are looked at beside the decoder. Known are H.264, HEVC, VP8, VP9 (key frames),
+MPEG-1/2, MPEG-4 part 2 and Motion JPEG; packets of other codecs say nothing here.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ _START = b"\0\0\1"
 _EXTENDED_PROFILES = frozenset({44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 144, 244})
 _MACROBLOCK_PX = 16
 _MAX_EXPONENT = 31
+_HEVC_PROFILE_BITS, _HEVC_LEVEL_BITS = 88, 8
 
 
 def size_reader(fourcc: str) -> Callable[[bytes], Size | None] | None:
@@ -134,6 +135,75 @@ def _skip_scaling_list(bits: _Bits, size: int) -> None:
         last = following or last
 
 
+def _hevc(packet: bytes) -> Size | None:
+    """Sequence parameter set in Annex B form (ITU-T H.265, 7.3.2.2)."""
+    begin = packet.find(_START)
+    while begin >= 0:
+        unit = begin + len(_START)
+        kind = (packet[unit] >> 1) & 0x3F
+        if kind < 32:
+            return None  # a picture: what announces it comes before
+        following = packet.find(_START, unit)
+        if kind == 33:
+            end = len(packet) if following < 0 else following
+            return _hevc_size(_Bits(packet[unit + 2 : end].replace(b"\0\0\3", b"\0\0")))
+        begin = following
+    return None
+
+
+def _hevc_size(bits: _Bits) -> Size:
+    bits.read(4)  # id of the video parameter set
+    sub_layers = bits.read(3)
+    bits.read(1)
+    bits.read(_HEVC_PROFILE_BITS + _HEVC_LEVEL_BITS)
+    present = [(bits.read(1), bits.read(1)) for _ in range(sub_layers)]
+    if sub_layers:
+        bits.read(2 * (8 - sub_layers))
+    for has_profile, has_level in present:
+        bits.read(_HEVC_PROFILE_BITS * has_profile + _HEVC_LEVEL_BITS * has_level)
+    bits.unsigned()  # id
+    chroma = bits.unsigned()
+    if chroma == 3:
+        bits.read(1)  # separate colour planes
+    width, height = bits.unsigned(), bits.unsigned()
+    if bits.read(1):
+        left, right, top, bottom = (bits.unsigned() for _ in range(4))
+        width -= (2 if chroma in (1, 2) else 1) * (left + right)
+        height -= (2 if chroma == 1 else 1) * (top + bottom)
+    return width, height
+
+
+def _vp8(packet: bytes) -> Size | None:
+    """Frame header of a key frame (RFC 6386, 9.1)."""
+    if packet[0] & 1 or packet[3:6] != b"\x9d\x01\x2a":
+        return None
+    mask = 0x3FFF  # the upper two bits ask for scaling
+    return int.from_bytes(packet[6:8], "little") & mask, int.from_bytes(packet[8:10], "little") & mask
+
+
+def _vp9(packet: bytes) -> Size | None:
+    """Uncompressed header of a key frame (VP9 specification, 6.2)."""
+    bits = _Bits(packet)
+    if bits.read(2) != 2:
+        return None
+    profile = bits.read(1) | (bits.read(1) << 1)
+    if profile == 3:
+        bits.read(1)
+    is_repeat, is_inter = bits.read(1), bits.read(1)
+    bits.read(2)
+    if is_repeat or is_inter or bits.read(24) != 0x498342:
+        return None
+    if profile >= 2:
+        bits.read(1)  # ten or twelve bits
+    has_subsampling = profile in (1, 3)
+    if bits.read(3) != 7:  # not sRGB
+        bits.read(1)
+        bits.read(3 if has_subsampling else 0)
+    elif has_subsampling:
+        bits.read(1)
+    return bits.read(16) + 1, bits.read(16) + 1
+
+
 def _mpeg2(packet: bytes) -> Size | None:
     """Sequence header (ISO/IEC 13818-2, 6.2.2.1)."""
     begin = packet.find(b"\0\0\1\xb3")
@@ -192,6 +262,9 @@ def _jpeg(packet: bytes) -> Size | None:
 
 _READERS: tuple[tuple[frozenset[str], Callable[[bytes], Size | None]], ...] = (
     (frozenset({"h264", "avc1", "avc3", "x264"}), _h264),
+    (frozenset({"hevc", "hvc1", "hev1", "h265", "x265"}), _hevc),
+    (frozenset({"vp80"}), _vp8),
+    (frozenset({"vp90"}), _vp9),
     (frozenset({"mpg1", "mpg2", "mpeg", "mp2v", "m2v1"}), _mpeg2),
     (frozenset({"fmp4", "mp4v", "xvid", "divx", "dx50"}), _mpeg4),
     (frozenset({"mjpg", "jpeg", "mjpa"}), _jpeg),
