@@ -48,8 +48,10 @@ class _Server(socketserver.ThreadingTCPServer):
 class MjpegServer(_Server):
     """``http://127.0.0.1:port/``: JPEG pictures as multipart/x-mixed-replace."""
 
-    def __init__(self, rate_hz: float, frames_per_connection: int | None = None) -> None:
+    def __init__(self, rate_hz: float, frames_per_connection: int | None = None, *, then_stalls: bool = False) -> None:
+        """After ``frames_per_connection`` the connection is closed, or kept open without a byte more."""
         self.rate_hz = rate_hz
+        self.then_stalls = then_stalls
         self.frames_per_connection = frames_per_connection
         super().__init__(_MjpegHandler)
 
@@ -72,6 +74,8 @@ class _MjpegHandler(socketserver.StreamRequestHandler):
                 self.server.stopping.wait(1.0 / self.server.rate_hz)
         except OSError:
             return
+        if self.server.then_stalls:
+            self.server.stopping.wait()
 
 
 class RtspServer(_Server):

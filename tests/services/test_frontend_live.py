@@ -95,6 +95,20 @@ def test_a_reader_that_falls_behind_loses_old_frames_not_new_ones() -> None:
     assert [frame.index for frame in late] == [1, 2, 3, 4, 5]
 
 
+def test_a_stream_that_stalls_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The connection stays open, and nothing comes."""
+    monkeypatch.setattr("vggt_motion.sources.camera._READ_TIMEOUT_S", 0.5)
+    server = MjpegServer(rate_hz=20.0, frames_per_connection=8, then_stalls=True)
+    try:
+        frames, source = _take(f"http://127.0.0.1:{server.port}/", 20)
+    finally:
+        server.close()
+    assert server.connections >= 3
+    assert source.reconnect_count >= 2
+    steps = np.diff([frame.capture_time_ns for frame in frames])
+    assert (steps > 0).all() and steps.max() > SECOND // 2
+
+
 def test_a_live_stream_through_the_frontend() -> None:
     server = MjpegServer(rate_hz=30.0)
     source = open_source(f"http://127.0.0.1:{server.port}/")

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from vggt_motion.errors import SourceError
+from vggt_motion.errors import SourceError, SourceTruncatedError
 from vggt_motion.sources.camera import CameraSource, is_device, is_stream, open_device, without_credentials
-from vggt_motion.sources.registry import SOURCE_KINDS
+from vggt_motion.sources.registry import SOURCE_KINDS, open_source
 from vggt_motion.sources.selection import Selection
 from vggt_motion.sources.source import CountsLosses, Frame, Source, losses_of
 
@@ -180,6 +180,38 @@ def test_a_stream_that_breaks_off_is_opened_again_and_times_go_on() -> None:
     assert times[3] - times[2] > 300 * MS
 
 
+def test_a_stream_that_comes_back_in_another_size_ends_with_one_line() -> None:
+    class Wider(ScriptedCapture):
+        def read(self) -> tuple[bool, np.ndarray | None]:
+            ok, picture = super().read()
+            return ok, None if picture is None else np.repeat(picture, 2, axis=1)
+
+    captures = iter([ScriptedCapture([50.0, 100.0, 150.0]), Wider([50.0, 100.0, 150.0])])
+    source = CameraSource(lambda: next(captures), "fake", Selection())
+    frames: list[Frame] = []
+    with pytest.raises(SourceTruncatedError, match=r"fake has changed size from 64x48 to 128x48; .* 3 frames before"):
+        frames.extend(source.frames())
+    source.close()
+    assert len(frames) == 3
+
+
+def test_a_camera_that_lowers_its_rate_keeps_its_own_steps() -> None:
+    """In the dark many webcams expose longer and halve their rate: 20 Hz, then 10 Hz, then 20 Hz again."""
+    stamps = np.cumsum([50.0] * 10 + [100.0] * 10 + [50.0] * 10)
+    gate = threading.Semaphore(0)
+    arrival = iter(1_700_000_000 * SECOND + round(float(stamp) * MS) + 7 * MS for stamp in stamps)
+    capture = ScriptedCapture([float(stamp) for stamp in stamps], gate=gate)
+    source = CameraSource(lambda: capture, "fake", Selection(), clock_ns=lambda: next(arrival))
+    stream = source.frames()
+    times = []
+    for _ in stamps:
+        gate.release()
+        times.append(next(stream).capture_time_ns)
+    source.close()
+    gate.release()
+    np.testing.assert_array_equal(np.diff(times), np.round(np.diff(stamps) * MS).astype(int))
+
+
 def test_no_camera() -> None:
     source = CameraSource(Closed, "fake", Selection(), first_frame_timeout_s=0.3)
     with pytest.raises(SourceError, match="no frame came from fake"):
@@ -239,6 +271,26 @@ def test_credentials_do_not_reach_the_status() -> None:
     assert without_credentials("rtsp://user:secret@10.0.0.7:554/live?token=1") == "rtsp://10.0.0.7:554/live"
     assert without_credentials("http://[::1]:80/a") == "http://[::1]:80/a"
     assert "secret" not in without_credentials("rtsp://u:secret@host:notaport/")
+
+
+@pytest.mark.parametrize(("location", "device"), [("camera:3", 3), ("camera:/dev/video2", "/dev/video2")])
+def test_a_device_is_opened_by_number_or_path(
+    location: str, device: int | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No machine that tests this has a camera: the driver is replaced, all above it is real."""
+    asked: list[object] = []
+
+    def video_capture(*arguments: object) -> ScriptedCapture:
+        asked.append(arguments)
+        return ScriptedCapture([50.0, 100.0, 150.0])
+
+    monkeypatch.setattr(cv2, "VideoCapture", video_capture)
+    source = open_source(location, end=3)
+    frames = list(source.frames())
+    source.close()
+    assert [_number_of(frame) for frame in frames] == [0, 1, 2]
+    assert asked[0] == (device,)
+    assert source.frame_rate_hz == 20.0
 
 
 def test_a_camera_has_a_number_or_a_path() -> None:

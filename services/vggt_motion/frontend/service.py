@@ -10,6 +10,7 @@ import contextlib
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -53,6 +54,8 @@ _HISTORY_FRAMES = 64  # for a recorder that joins late or loses its link for a m
 _REPORT_S = 0.2
 _DISK_RETRY_S = 1.0
 _SPOOL_POLL_S = 0.5
+_SILENT_S = 2.0  # a live camera without a frame for so long has stalled, and the status says so
+_RATE_FRAMES = 32  # frames over which the rate is measured that turns a delay in frames into seconds
 
 
 def main(
@@ -137,6 +140,8 @@ class _Frontend:
         self._unreadable_count = 0
         self._thin_until_ns: int | None = None
         self._newest_time_ns = 0
+        self._capture_times_ns: deque[int] = deque(maxlen=_RATE_FRAMES)
+        self._waiting_since: float | None = None  # for the source's next frame
         self._outbox: _Outbox | None = None
         if source.is_live:
             self._outbox = _Outbox(context, self._camera)
@@ -156,8 +161,11 @@ class _Frontend:
         """Send everything; raises SourceTruncatedError at the very end when the source ended early."""
         self._send_started()
         truncation: SourceTruncatedError | None = None
+        is_over = threading.Event()
+        if self._source.is_live:
+            threading.Thread(target=self._tell_of_silence, args=(is_over,), name="silence", daemon=True).start()
         try:
-            for frame in self._source.frames():
+            for frame in self._arriving():
                 if self._context.stopping.is_set():
                     return
                 if self._is_thinned(frame):
@@ -174,6 +182,8 @@ class _Frontend:
                 self._report("working")
         except SourceTruncatedError as error:
             truncation = error
+        finally:
+            is_over.set()
         if self._context.stopping.is_set():
             return  # a live source that we closed, not one that ended
         self._send(self._pipeline.finish())
@@ -183,6 +193,31 @@ class _Frontend:
         self._report("ended", is_due=True)
         if truncation is not None:
             raise truncation
+
+    def _arriving(self) -> Iterator[Frame]:
+        """The source's frames; while one is waited for, that is known."""
+        self._waiting_since = time.monotonic()
+        for frame in self._source.frames():
+            self._waiting_since = None
+            self._capture_times_ns.append(frame.capture_time_ns)
+            yield frame
+            self._waiting_since = time.monotonic()
+
+    def _tell_of_silence(self, is_over: threading.Event) -> None:
+        """Say in the status that a live camera has stalled; its next frame takes that back."""
+        while not is_over.wait(_REPORT_S):
+            since = self._waiting_since
+            if since is None or (silent_s := time.monotonic() - since) < _SILENT_S:
+                continue
+            detail = f"no frame comes from {self._source.description}"
+            self._context.set_health("waiting", detail, silent_s=round(silent_s, 1), **losses_of(self._source))
+
+    def _frame_interval_s(self) -> float | None:
+        """As measured over the last frames: the rate of a live camera changes, and the bus knows none."""
+        times = self._capture_times_ns
+        if len(times) > 1:
+            return (times[-1] - times[0]) * 1e-9 / (len(times) - 1)
+        return None if self._source.frame_rate_hz is None else 1.0 / self._source.frame_rate_hz
 
     def _take_up(self) -> tuple[int, int]:
         """Epoch and first segment index of a live camera: after what an earlier process of it left in the log."""
@@ -289,7 +324,7 @@ class _Frontend:
         self._next_report = now + _REPORT_S
         pipeline = self._pipeline
         delay = pipeline.lookahead_frames
-        rate_hz = self._source.frame_rate_hz
+        interval_s = self._frame_interval_s()
         self._context.set_health(
             state,
             self._source.description,
@@ -303,7 +338,8 @@ class _Frontend:
             thinned_frames=self._thinned_count,
             unreadable_frames=self._unreadable_count,
             **({} if self._outbox is None else self._outbox.counters()),
-            **({} if rate_hz is None else {"smoothing_delay_s": delay / rate_hz}),
+            **({} if interval_s is None else {"smoothing_delay_s": delay * interval_s}),
+            **({"silent_s": 0.0} if self._source.is_live else {}),
             **losses_of(self._source),
         )
 

@@ -1,7 +1,9 @@
 """Live pictures: a camera at this machine, or a network stream (RTSP and whatever else FFmpeg reads from a URL).
 
 The newest frame wins: a thread takes every frame from the device at once; those that the frontend has no time for are
-dropped, oldest first, and counted. A stream that stalls or breaks off is opened again, for as long as it takes.
+dropped, oldest first, and counted. A stream that stalls or breaks off is opened again, for as long as it takes. One
+that comes back with pictures of another size has ended, and what was read is finished. (Within one connection OpenCV
+scales such pictures to the first size, and nobody can tell.)
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.errors import SourceError
+from vggt_motion.errors import SourceError, SourceTruncatedError
 from vggt_motion.sources.encoded import JPEG, encode_video_frame
 from vggt_motion.sources.selection import Selection
 from vggt_motion.sources.source import Frame
@@ -117,17 +119,26 @@ class CameraSource:
 
         Raises:
             SourceError: not one frame arrived in time.
+            SourceTruncatedError: the stream was opened again and has another size.
         """
         repair = TimestampRepair(round(NANOSECONDS / self._selection.nominal_rate_hz), self.description)
         quiet_ffmpeg()
         threading.Thread(target=self._read_on, name="camera", daemon=True).start()
         position = index = 0
+        size: tuple[int, int] | None = None
         while not self._selection.is_past(position):
             picture = self._next(self._first_frame_timeout_s if position == 0 else None)
             if picture is None:
                 if position == 0 and not self._is_closed.is_set():
                     raise SourceError(f"no frame came from {self._name} within {self._first_frame_timeout_s:g} s")
                 return
+            height, width = picture.pixels.shape[:2]
+            size = size or (width, height)
+            if size != (width, height):
+                raise SourceTruncatedError(
+                    f"{self._name} has changed size from {size[0]}x{size[1]} to {width}x{height}; "
+                    f"the input ends there and the {index} frames before it are used"
+                )
             if self._selection.takes(position):
                 yield Frame(index, repair(picture.capture_time_ns), encode_video_frame(picture.pixels), JPEG)
                 index += 1
