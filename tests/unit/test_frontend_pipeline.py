@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -297,6 +299,79 @@ def test_standing_at_a_red_light(data_dir: Path) -> None:
 @pytest.mark.parametrize("name", ["video/highway_straight.mp4", "kitti_raw_road_91", "kitti_06_first51"])
 def test_driving_has_no_static_frame(data_dir: Path, name: str) -> None:
     assert "S" not in Run(_frames(data_dir, name)).states
+
+
+def _changed(frames: list[Frame], change: Callable[[np.ndarray], np.ndarray]) -> list[Frame]:
+    """The frames with every picture changed."""
+    result = []
+    for frame in frames:
+        pixels = np.asarray(cv2.imdecode(np.frombuffer(frame.encoded, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
+        data = cv2.imencode(".jpg", change(pixels), [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+        result.append(Frame(frame.index, frame.capture_time_ns, data, "image/jpeg"))
+    return result
+
+
+def _small(pixels: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.resize(pixels, (416, 128), interpolation=cv2.INTER_AREA))
+
+
+def _night(pixels: np.ndarray) -> np.ndarray:
+    noise = np.random.default_rng(0).normal(0, 3, pixels.shape)
+    return np.clip(15 + 0.2 * pixels + noise, 0, 255).astype(np.uint8)
+
+
+@functools.cache
+def _barrel_map(height: int, width: int) -> np.ndarray:
+    camera = np.array([[0.58 * width, 0, width / 2], [0, 0.58 * width, height / 2], [0, 0, 1.0]])
+    seen = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 1, 2).astype(np.float32)
+    source = cv2.undistortPoints(seen, camera, np.array([-0.3, 0, 0, 0.0]), P=camera).reshape(height, width, 2)
+    return np.asarray(source, np.float32)
+
+
+def _barrel(pixels: np.ndarray) -> np.ndarray:
+    """Seen through a lens with a strong barrel distortion."""
+    return np.asarray(cv2.remap(pixels, _barrel_map(*pixels.shape), None, cv2.INTER_LINEAR))  # type: ignore[call-overload]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("change", [_small, _night, _barrel])
+def test_turns_of_kitti_00_through_other_cameras(data_dir: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    frames = _frames(data_dir, "kitti_00_first200")
+    truth = is_turning(data_dir / "kitti_00_first200", [f.capture_time_ns for f in frames])
+    run = Run(_changed(frames, change))
+    assert _turn_f1(run, truth) >= 0.9
+    assert "S" not in run.states
+    # a lens changes the scale of the parallax, but starves nothing
+    assert 50 <= len(run.keyframes) < len(frames) / 2
+
+
+@pytest.mark.data
+def test_turns_of_kitti_00_at_5_hz(data_dir: Path) -> None:
+    frames = _frames(data_dir, "kitti_00_first200")
+    times = [frame.capture_time_ns for frame in frames]
+    kept = [Frame(k, f.capture_time_ns, f.encoded, f.media_type) for k, f in enumerate(frames[::2])]
+    run = Run(kept)
+    # the smoothing window is two frames, which are twice as long here
+    assert _turn_f1(run, is_turning(data_dir / "kitti_00_first200", times, 4.0)[1::2]) >= 0.9
+    assert "S" not in run.states
+
+
+@pytest.mark.data
+def test_a_stop_put_into_kitti_00(data_dir: Path) -> None:
+    """The same picture 40 times with fresh noise, then the drive goes on."""
+    frames = _frames(data_dir, "kitti_00_first200")[:120]
+    rng = np.random.default_rng(0)
+    still = np.asarray(cv2.imdecode(np.frombuffer(frames[60].encoded, np.uint8), cv2.IMREAD_GRAYSCALE), np.int16)
+    stop = [np.clip(still + rng.normal(0, 4, still.shape), 0, 255).astype(np.uint8) for _ in range(39)]
+    encoded = [frame.encoded for frame in frames[:61]]
+    encoded += [cv2.imencode(".jpg", image)[1].tobytes() for image in stop]
+    encoded += [frame.encoded for frame in frames[61:]]
+    run = Run([Frame(k, k * 100_000_000, data, "image/jpeg") for k, data in enumerate(encoded)])
+    standing = [k for k, state in enumerate(run.states) if state == "S"]
+    # the smoothing blurs both ends
+    assert set(range(66, 98)) <= set(standing) <= set(range(60, 101))
+    boundaries = [k.frame_index for k in run.keyframes if k.state is MotionState.STATIC]
+    assert boundaries == [standing[0], standing[-1]]
 
 
 @pytest.mark.data

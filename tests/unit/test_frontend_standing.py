@@ -88,6 +88,39 @@ def test_standing_while_exposure_changes() -> None:
     assert set(states(traces)) == {"S"}
 
 
+def test_standing_under_lamps_that_flicker_through_a_rolling_shutter() -> None:
+    """Bands of brightness run down the image: each row is exposed at another moment of the lamps' 100 Hz."""
+    rng = np.random.default_rng(4)
+    scene, row = texture(0), np.arange(HEIGHT)[:, None]
+    traces, keyframes = trace(
+        with_noise(scene * (1.0 + 0.2 * np.sin(2 * np.pi * (row / 60 + 0.17 * k))), rng, 2.0) for k in range(40)
+    )
+    assert set(states(traces)) == {"S"}
+    assert len(keyframes) == 2
+
+
+def test_driving_with_dirt_on_the_windscreen() -> None:
+    """Sixty spots, blurred as they are near: a tenth of the image that never moves."""
+    rng = np.random.default_rng(5)
+    scene, dirt = texture(0), np.zeros((HEIGHT, WIDTH), np.float32)
+    for x, y in rng.integers(8, [WIDTH - 8, HEIGHT - 8], (60, 2)).tolist():
+        cv2.circle(dirt, (x, y), 6, 1.0, -1)
+    dirt = np.asarray(cv2.GaussianBlur(dirt, (0, 0), 1.5))
+    traces, keyframes = trace(zoomed(scene, 1.0 + 0.04 * (k % 12)) * (1 - dirt) + 35 * dirt for k in range(60))
+    assert "S" not in states(traces)
+    without, _ = trace(zoomed(scene, 1.0 + 0.04 * (k % 12)) for k in range(60))
+    assert len(keyframes) > 0.7 * sum(item.is_keyframe for item in without)
+
+
+def test_a_stop_of_exact_repeats_is_standing() -> None:
+    """A camera or an encoder that repeats what does not change, here after driving and before driving on."""
+    scene = texture(0)
+    factors = [*(1.03**k for k in range(15)), *([1.03**15] * 30), *(1.03**k for k in range(16, 28))]
+    line = states(trace(zoomed(scene, factor) for factor in factors)[0])
+    assert line[:12].count("S") == 0 and line[-8:].count("S") == 0
+    assert "S" * 20 in line
+
+
 def test_standing_while_a_lorry_crosses() -> None:
     """Half of the image is another one, moving by 8 px/frame, for two seconds."""
     rng = np.random.default_rng(3)

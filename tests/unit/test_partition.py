@@ -116,6 +116,42 @@ def test_temporal_bases_have_one_length(runs: list[tuple[MotionState, int, int]]
     assert all(len(s.base_keyframe_ids) == overlap + extra for s in segments[:-1])
 
 
+@given(sequences, st.sampled_from([("vggt_long", 60, 30), ("vggt_long_75", 75, 30)]))
+def test_vggt_long_invariants(runs: list[tuple[MotionState, int, int]], chunk: tuple[str, int, int]) -> None:
+    """Every frame is a keyframe there, and its chunks are blind to the motion."""
+    preset, size, overlap = chunk
+    config = FrontendConfig.model_validate({"preset": preset})
+    frames = [(state, True) for state, _ in _expand(runs)]
+    segments = _partition(frames, config)
+    _check_common(frames, segments, overlap, size - overlap)
+    assert all(len(s.base_keyframe_ids) == size - overlap for s in segments[:-1])
+
+
+@given(st.integers(1, 600), st.integers(0, 40), st.integers(0, 40))
+def test_a_long_roundabout_is_cut_at_the_cap_only(turning: int, before: int, after: int) -> None:
+    """Straight on, round and round, straight on: each piece of the turn but its last has the cap's length."""
+    config = FrontendConfig()
+    frames = [(L, True)] * before + [(T, True)] * turning + [(L, True)] * after
+    segments = _partition(frames, config)
+    _check_common(frames, segments, config.overlap_keyframes, config.turn_max_keyframes)
+    holding = [s for s in segments if any(entry.state is T for entry in s.frames)]
+    assert [len(s.base_keyframe_ids) for s in holding[:-1]] == [config.turn_max_keyframes] * (len(holding) - 1)
+    assert all(s.closed_by == "turn_cap" for s in holding[:-1])
+
+
+@given(st.lists(st.sampled_from([S, T, L]), min_size=1, max_size=300), sizes)
+def test_states_that_change_from_frame_to_frame(states: list[MotionState], size: tuple[int, int, int]) -> None:
+    overlap, budget = size[0], size[0] + 1 + size[1]
+    cap = budget + size[2]
+    config = FrontendConfig(overlap_keyframes=overlap, max_keyframes=budget, turn_max_keyframes=cap)
+    frames = [(state, True) for state in states]
+    segments = _partition(frames, config)
+    _check_common(frames, segments, overlap, cap)
+    for segment in segments:
+        if all(entry.state is not T for entry in segment.frames):
+            assert len(segment.base_keyframe_ids) <= budget
+
+
 @given(sequences, st.floats(1.0, 200.0))
 def test_parallax_bases_reach_the_parallax(runs: list[tuple[MotionState, int, int]], total: float) -> None:
     config = FrontendConfig(partition="parallax", partition_parallax_px=total)

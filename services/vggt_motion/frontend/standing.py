@@ -17,7 +17,13 @@ A shift is judged by two quantiles: the median, and the upper quartile with a la
 sky. Who has a vote decides more than the bounds do: cells with texture, that the ego mask leaves, that were not learned
 to be fixed to the camera (``overlay.py``), and whose flow is either next to nothing or explains the image better than
 no motion (``MotionProof``). The last is what noise, compression flicker and the dark need: there DIS finds flow of a
-pixel between images of a standing camera. Changes of exposure it does not see, as its patches are mean-normalised.
+pixel between images of a standing camera. Changes of exposure it does not see, as its patches are mean-normalised; that
+holds for bands of lamplight that a rolling shutter draws across the image too, as long as they are wider than a patch.
+
+Exact repeats of a frame say nothing: in a drive they are a slow camera in a faster file, at a stop they are an encoder
+that saves its work. They have no weight in the static ratio (``motion.py``); only where nothing else came does the
+camera stand. A fit of one camera motion (rotation and direction of translation) to the flow was tried and left out:
+on straight drives it is ill-conditioned, and it costs more than the flow itself.
 
 The two errors do not cost the same. Motion that is called standing loses poses; standing that is called straight motion
 costs next to nothing, as without parallax no frame becomes a keyframe. In doubt the camera moves.
