@@ -17,6 +17,7 @@ from vggt_motion.config import Config
 from vggt_motion.errors import InputError, SourceTruncatedError
 from vggt_motion.evaluation.inspect_plot import Picture, inspect_figure
 from vggt_motion.evaluation.plot_style import to_png
+from vggt_motion.evaluation.plots import STATE_NAMES
 from vggt_motion.evaluation.report_style import CSS
 from vggt_motion.frontend.pipeline import FrameTrace, FrontendPipeline, KeyframeOutput, Output
 from vggt_motion.records import Keyframe, MotionState, Segment
@@ -194,20 +195,20 @@ def _page(collected: _Collected, config: Config, description: str, truncated: st
         ("frames", f"{total}"),
         ("keyframes", f"{len(collected.keyframes)}"),
         ("submaps", f"{len(collected.segments)}"),
-        *((f"state {state.value}", f"{100 * counts[state] / max(1, total):.1f}%") for state in MotionState),
+        *((STATE_NAMES[state], f"{100 * counts[state] / max(1, total):.1f}%") for state in MotionState),
     ]
     rows = []
     pairs = zip(collected.segments, collected.first_pictures, collected.last_pictures, strict=True)
     for segment, (first, first_jpeg), (last, last_jpeg) in list(pairs)[:_MAX_BORDERS_ON_PAGE]:
-        states = Counter(entry.state.value for entry in segment.frames)
-        mixture = ", ".join(f"{state} {states[state]}" for state in sorted(states))
+        states = Counter(entry.state for entry in segment.frames)
+        mixture = ", ".join(f"{STATE_NAMES[state]} {states[state]}" for state in MotionState if states[state])
         rows.append(
             f'<tr><td class="number">{segment.index}</td>'
             f"<td>{image('image/jpeg', first_jpeg, f'frame {first}')}<br>frame {first}</td>"
             f"<td>{image('image/jpeg', last_jpeg, f'frame {last}')}<br>frame {last}</td>"
             f'<td class="number">{len(segment.base_keyframe_ids)}</td>'
             f'<td class="number">{len(segment.overlap_keyframe_ids)}</td>'
-            f"<td>{text(mixture)}</td><td>{text(segment.closed_by)}</td></tr>\n"
+            f"<td>{text(mixture)}</td><td>{text(segment.closed_by.replace('_', ' '))}</td></tr>\n"
         )
     hidden = len(collected.segments) - len(rows)
     more = f'<p class="muted">{hidden} more submaps are in the table {CSV_NAME}.</p>' if hidden > 0 else ""

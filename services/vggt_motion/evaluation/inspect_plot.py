@@ -18,6 +18,7 @@ from vggt_motion.records import MotionState, Segment
 
 _WIDTH_IN = 14.0
 _MAX_THUMBNAILS = 7  # that stand side by side; the page shows them all
+_LEGEND_SHARE = 0.22  # of the height of a panel
 _MAX_DRAWN = 6000  # more is finer than the picture
 _MAX_SHADED = 400  # runs of a state; with more the shade is a blur and the file slow
 
@@ -71,7 +72,8 @@ def inspect_figure(
     axes = rows[2]
     axes.plot(seconds[kept], series([t.profile.static_ratio for t in traces]), color=BLUE, lw=1.3)
     axes.axhline(config.static_ratio, color=VERMILION, lw=1.0, ls="--", label=f"threshold {config.static_ratio:g}")
-    axes.set_ylim(-0.03, 1.05)
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_yticks(np.linspace(0.0, 1.0, 6))
     axes.set_ylabel("static ratio")
     axes = rows[3]
     axes.plot(seconds[kept], series([t.profile.yaw_px for t in traces]), color=BLUE, lw=1.3, label="common shift")
@@ -92,6 +94,8 @@ def inspect_figure(
     axes.set_ylabel("parallax, px")
     axes.set_xlabel("time after the first frame, s")
     for axes in rows[2:]:
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + _LEGEND_SHARE * (high - low))  # the legend hides no curve
         axes.legend(loc="upper right", fontsize=8.5, ncols=3)
     return figure
 
@@ -158,4 +162,13 @@ def _draw_pictures(
                 arrowprops={"arrowstyle": "-", "color": MUTED, "lw": 0.8},
             )
         )
-        axes.text(slot * end, 1.0, f"frame {index}", ha="center", va="top", fontsize=8.5, color=INK)
+        axes.annotate(
+            f"frame {index}",
+            (slot * end, 0.56),
+            (0.0, 0.5 * zoom * picture.shape[0] + 3.0),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=8.5,
+            color=INK,
+        )

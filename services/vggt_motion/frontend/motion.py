@@ -2,6 +2,13 @@
 
 Everything here is a causal computation with a fixed look-ahead, fed frame by frame, so that a live stream and a file
 give the same states. What decides about standing is in ``standing.py``.
+
+The yaw score is the common shift of the middle of the image, in pixels: without calibration the angle is not known.
+tau_turn = 1.6 px per 0.1 s is 5 degrees/s for KITTI's field of view of 81 degrees and 3 for one of 57 degrees. On the
+road that is enough. A camera in the hand, close to what it sees, shifts the image by moving sideways as well, and this
+score does not tell that from turning (F1 0.65 on RedKitchen; the true yaw rate behind the same threshold in pixels has
+0.86). A fit of rotation and direction of translation to the flow does, to 0.82, but on a road, where sideways motion
+and turning look alike, it is worse (KITTI 00: 0.60 where the shift has 0.98), and it costs more than DIS itself.
 """
 
 from __future__ import annotations

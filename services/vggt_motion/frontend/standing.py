@@ -22,8 +22,10 @@ holds for bands of lamplight that a rolling shutter draws across the image too, 
 
 Exact repeats of a frame say nothing: in a drive they are a slow camera in a faster file, at a stop they are an encoder
 that saves its work. They have no weight in the static ratio (``motion.py``); only where nothing else came does the
-camera stand. A fit of one camera motion (rotation and direction of translation) to the flow was tried and left out:
-on straight drives it is ill-conditioned, and it costs more than the flow itself.
+camera stand.
+
+What is asked of the flow is thus consistency with one camera motion, none at all, over a baseline that grows. Other
+motions need not be fitted for that (what such a fit is worth for turning is said in ``motion.py``).
 
 The two errors do not cost the same. Motion that is called standing loses poses; standing that is called straight motion
 costs next to nothing, as without parallax no frame becomes a keyframe. In doubt the camera moves.
