@@ -68,6 +68,9 @@ def run(
     known_distance: Annotated[
         float | None, typer.Option(metavar="METRES", help="Travelled distance, if known: sets the scale.")
     ] = None,
+    intrinsics: Annotated[
+        str | None, typer.Option(metavar="FX,FY,CX,CY[,K1]", help="The camera, if known, in pixels of the images.")
+    ] = None,
     ground_truth: Annotated[
         Path | None, typer.Option(help="KITTI or TUM trajectory to compare with; adds ATE, drift and an overlay.")
     ] = None,
@@ -80,6 +83,8 @@ def run(
     values = list(assignments or ())
     if known_distance is not None:
         values.append(f"backend.known_distance_m={known_distance}")
+    if intrinsics is not None:
+        values.extend(_intrinsics_values(intrinsics))
     request = RunRequest(
         source=source,
         out=out if out is not None else Path("out") / (Path(source).stem or "run"),
@@ -90,6 +95,13 @@ def run(
         ego_mask=ego_mask,
     )
     raise typer.Exit(run_to_results(request, ground_truth=ground_truth, fresh=fresh))
+
+
+def _intrinsics_values(text: str) -> list[str]:
+    names, numbers = ("fx", "fy", "cx", "cy", "k1"), text.split(",")
+    if len(numbers) not in (4, 5):
+        raise InputError(f"--intrinsics '{text}' is not of the form FX,FY,CX,CY or FX,FY,CX,CY,K1")
+    return [f"inference.intrinsics.{name}={number.strip()}" for name, number in zip(names, numbers, strict=False)]
 
 
 @app.command()

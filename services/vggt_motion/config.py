@@ -205,6 +205,16 @@ class SkyConfig(Section):
     )
 
 
+class IntrinsicsConfig(Section):
+    """A camera that the user knows: pixels of the images as recorded, the centre of the top left one is (0, 0)."""
+
+    fx: float = Field(gt=0, description="focal length, px")
+    fy: float | None = Field(None, gt=0, description="None = square pixels")
+    cx: float = Field(ge=0, description="principal point, px from the left")
+    cy: float = Field(ge=0, description="principal point, px from the top")
+    k1: float = Field(0.0, ge=-1, le=1, description="radial coefficient, as OpenCV defines it")
+
+
 class InferenceConfig(Section):
     """The predictor and its worker."""
 
@@ -214,6 +224,7 @@ class InferenceConfig(Section):
         None, gt=0.1, lt=20, description="known focal length / image width; None = self-calibrate"
     )
     radial_k1: float | None = Field(None, ge=-1, le=1, description="known radial coefficient")
+    intrinsics: IntrinsicsConfig | None = Field(None, description="known camera; replaces the two above")
     job_deadline_s: float = Field(
         300.0, gt=0, description="a prediction that takes longer is ended and reported as failed"
     )

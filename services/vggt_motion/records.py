@@ -116,7 +116,9 @@ class FocalHint:
     focal_over_width: float  # focal length divided by the image width
     relative_sigma: float  # its standard deviation, relative
     radial_k1: float = 0.0
-    is_fixed: bool = False  # given by the user: not to be refined
+    is_fixed: bool = False  # given by the user: not to be replaced by an estimate
+    # Of the images as recorded, where the user gave all of them; refined within the accuracy of a calibration.
+    intrinsics: Intrinsics | None = None
 
 
 class SubmapPart(StrEnum):

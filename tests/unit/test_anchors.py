@@ -237,3 +237,37 @@ def test_views_share_no_state_with_the_result() -> None:
     register(spec_of(1), frames, CONFIG)
     np.testing.assert_array_equal(frames[0].in_i.depth, before)
     assert isinstance(frames[0].in_i, AnchorView)
+
+
+def turned_only(frame: SharedFrame, side: str) -> SharedFrame:
+    """What a submap without translations knows of a frame: its rotation."""
+    seen: AnchorView = getattr(frame, side)
+    pose = se3.make(seen.submap_from_camera[:3, :3], np.zeros(3))
+    nothing = np.zeros_like(seen.depth)
+    return replace(frame, **{side: replace(seen, depth=nothing, confidence=nothing, submap_from_camera=pose)})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("side", ["in_i", "in_j"])
+def test_a_submap_that_only_turned_is_joined_by_its_rotations(side: str) -> None:
+    frames = overlap()
+    constraint = register(spec_of(), [turned_only(frame, side) for frame in frames], RegistrationConfig())
+    assert constraint.accepted
+    assert constraint.attempts[-1].anchor == "rotation"
+    truth = TRUTH
+    turned = np.linalg.norm(se3.so3_log(constraint.j_from_i.rotation @ truth.rotation.T))
+    assert turned < 1e-6
+    # the last camera is at one place in both, and the unit is carried over
+    last = turned_only(frames[-1], side)
+    at = constraint.j_from_i.act(last.in_i.submap_from_camera[:3, 3])
+    np.testing.assert_allclose(at, last.in_j.submap_from_camera[:3, 3], atol=1e-9)
+    assert constraint.j_from_i.scale == 1.0
+    deviations = np.sqrt(np.diag(np.linalg.inv(constraint.information)))
+    assert deviations[6] > 0.4 and deviations[:3].max() < 0.02  # the scale is an assumption, the rotation is not
+
+
+def test_a_submap_that_only_turned_is_not_joined_against_its_rotations() -> None:
+    frames = [turned_only(frame, "in_j") for frame in overlap()]
+    for k, frame in enumerate(frames):
+        pose = frame.in_j.submap_from_camera @ se3.make(se3.so3_exp(np.array([0.0, 0.2 * (-1) ** k, 0.0])), np.zeros(3))
+        frames[k] = spoil(frame, submap_from_camera=pose)
+    assert not register(spec_of(), frames, RegistrationConfig()).accepted

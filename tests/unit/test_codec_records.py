@@ -132,7 +132,8 @@ def submap_specs(draw: st.DrawFn) -> SubmapSpec:
     first, second = sorted([draw(st.integers(0, len(ids) - 1)), draw(st.integers(1, len(ids)))])
     second = max(second, first + 1)
     copies = ((ids[0], ids[1]),) if draw(st.booleans()) else ()
-    hint = st.builds(FocalHint, positive, untold.filter(lambda value: not math.isnan(value)), finite, st.booleans())
+    told = untold.filter(lambda value: not math.isnan(value))
+    hint = st.builds(FocalHint, positive, told, finite, st.booleans(), st.none() | intrinsics)
     return SubmapSpec(
         draw(indices), draw(st.integers(1, 9)), tuple(ids[:first]), tuple(ids[first:second]), tuple(ids[second:]),
         copies, draw(st.none() | hint), draw(st.none() | blob_refs), draw(st.none() | st.sampled_from(SubmapPart)),

@@ -84,6 +84,34 @@ def test_sky_has_no_confidence(forward: tuple[dict[int, dense.DepthMap], list[np
         assert (maps[position].confidence[inner] > 0.1).mean() < 0.005
 
 
+@pytest.mark.parametrize("step", [(0.0, 0.0, 0.8), (0.5, 0.0, 0.0)], ids=["ahead at our speed", "crossing"])
+def test_moving_objects_have_no_confidence(step: tuple[float, float, float]) -> None:
+    poses = sfm_scene.drive(6, 0.8)
+    grey, truth, cars = {}, [], {}
+    for k, pose in enumerate(poses):
+        centre = np.array([-1.0, 0.4, 9.0]) + k * np.array(step)
+        car = sfm_scene.Rectangle((centre[0], centre[1], centre[2]), (1.5, 0.0, 0.0), (0.0, 1.1, 0.0), 40.0)
+        image, seen = sfm_scene.render([*sfm_scene.street(), car], pose, CAMERA)
+        _, without = sfm_scene.render(sfm_scene.street(), pose, CAMERA)
+        grey[k], cars[k] = image[..., 0], seen != without
+        truth.append(np.where(cars[k], np.inf, seen))  # the structure knows nothing of what moves
+    maps = dense.dense_depth(
+        grey,
+        {k: se3.inverse(pose) for k, pose in enumerate(poses)},
+        {k: sparse_of(true, CAMERA) for k, true in enumerate(truth)},
+        CAMERA,
+        np.ones((CAMERA.height_px, CAMERA.width_px), dtype=bool),
+    )
+    for k in (1, 2, 3):
+        inner = cars[k].copy()
+        for shift in range(1, 4):  # away from the edge, where a window sees the street behind
+            for axis in (0, 1):
+                inner &= np.roll(cars[k], shift, axis) & np.roll(cars[k], -shift, axis)
+        assert inner.sum() > 300
+        assert (maps[k].confidence[inner] > 0.5).mean() < 0.02
+        assert (maps[k].confidence[~cars[k] & np.isfinite(truth[k])] > 0.5).mean() > 0.2
+
+
 def test_the_epipole_of_forward_motion_has_little_confidence(
     forward: tuple[dict[int, dense.DepthMap], list[np.ndarray]],
 ) -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 import sfm_scene
-from vggt_motion.config import InferenceConfig, SfmConfig
+from vggt_motion.config import InferenceConfig, IntrinsicsConfig, SfmConfig
 from vggt_motion.errors import MissingDependencyError
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics
@@ -202,6 +202,55 @@ def test_pure_rotation_keeps_the_rotations_and_claims_no_translation() -> None:
     assert predict(keyframes).verdict is SubmapVerdict.ROTATION_ONLY  # and without a hint
 
 
+def test_a_turn_on_the_spot_within_a_drive_is_not_taken_for_motion() -> None:
+    poses = sfm_scene.drive(5, 0.8)
+    for _ in range(6):
+        poses.append(poses[-1] @ se3.make(se3.so3_exp(np.array([0.0, 0.14, 0.0])), np.zeros(3)))
+    for _ in range(4):
+        poses.append(poses[-1] @ se3.make(np.eye(3), np.array([0.1, 0.0, 0.5])))
+    keyframes, _ = sfm_scene.keyframes(sfm_scene.street(), poses, CAMERA)
+    prediction = predict(keyframes)
+    assert prediction.verdict is SubmapVerdict.LOW_QUALITY
+    assert "turned on the spot" in prediction.reason
+    assert [frame.position for frame in prediction.frames] == list(range(15))
+    assert max(rotation_errors_deg(prediction, poses)) < 1.5
+    found = centres(prediction)
+    for position in range(5, 11):
+        np.testing.assert_allclose(found[position], found[4], atol=1e-9)
+        assert position == 10 or not prediction.frames[position].confidence.any()
+    for part in (slice(0, 5), slice(10, 15)):  # each right by itself
+        assert sfm_scene.position_error(found[part], [pose[:3, 3] for pose in poses[part]]) < 0.02
+    # a doubtful submap says so in its confidence
+    assert 0.0 < max(frame.confidence.max() for frame in prediction.frames) <= 0.6
+
+
+def test_known_intrinsics_place_a_camera_whose_middle_is_elsewhere() -> None:
+    camera = Intrinsics(300.0, 285.0, 262.0, 80.0, 480, 180)
+    poses = sfm_scene.drive(8, 0.8, 20.0)
+    keyframes, depths = sfm_scene.keyframes(sfm_scene.street(), poses, camera)
+    known = IntrinsicsConfig(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+    prediction = predict(keyframes, config=InferenceConfig(intrinsics=known))
+    assert prediction.verdict is SubmapVerdict.GOOD
+    assert sfm_scene.position_error(centres(prediction), [pose[:3, 3] for pose in poses]) < 0.004
+    assert max(rotation_errors_deg(prediction, poses)) < 0.5
+    frame = prediction.frames[3]
+    recorded = frame.intrinsics.resized(480, 180)
+    assert (recorded.fx, recorded.fy) == pytest.approx((300.0, 285.0), rel=0.01)
+    assert (recorded.cx, recorded.cy) == pytest.approx((262.0, 80.0), abs=2.0)
+    height, width = frame.depth.shape
+    truth = cv2.resize(depths[3], (width, height), interpolation=cv2.INTER_NEAREST)
+    confident = (frame.confidence > 0.5) & np.isfinite(truth)
+    ratio = truth[confident] / frame.depth[confident]
+    assert np.median(np.abs(ratio / np.median(ratio) - 1.0)) < 0.02
+
+
+def test_a_principal_point_outside_of_the_image_is_refused(turning: Scenes) -> None:
+    known = IntrinsicsConfig(fx=300.0, cx=500.0, cy=80.0)
+    prediction = predict(turning[0], config=InferenceConfig(intrinsics=known))
+    assert prediction.verdict is SubmapVerdict.FAILED
+    assert "principal point" in prediction.reason
+
+
 def test_identical_images_are_a_camera_that_did_not_move() -> None:
     prediction = predict(keyframes_of([noise(0)] * 4))
     assert prediction.verdict is SubmapVerdict.ROTATION_ONLY
@@ -248,8 +297,8 @@ def test_global_mapping_agrees_with_growth(turning: Scenes) -> None:
     working = images.prepare(keyframes, None, 620)
     positions = list(range(9))
     matched = tracks.match(working, positions)
-    placed = globalmap.place(matched, positions, 480, 180, 300.0, True, seed=0)
-    again = globalmap.place(matched, positions, 480, 180, 300.0, True, seed=0)
+    placed = globalmap.place(matched, positions, 480, 180, 300.0, (0.0, 0.0), True, seed=0)
+    again = globalmap.place(matched, positions, 480, 180, 300.0, (0.0, 0.0), True, seed=0)
     assert placed is not None and again is not None
     assert sorted(placed.camera_from_submap) == positions
     for position in positions:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 _UNDISTORT_ITERATIONS = 12
+_UNDISTORT_TOLERANCE = 1e-9  # Newton squares it: what is left after such a step is rounding
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,11 @@ def undistort_rays(
     radius = distorted_radius.copy()
     fold = 1.0 / np.sqrt(-3.0 * k1) if k1 < 0.0 else np.inf
     for _ in range(_UNDISTORT_ITERATIONS):
-        slope = np.maximum(1.0 + 3.0 * k1 * radius**2, 0.1)
-        radius = np.clip(radius - (radius * (1.0 + k1 * radius**2) - distorted_radius) / slope, 0.0, fold)
+        square = k1 * radius * radius
+        step = (radius * (1.0 + square) - distorted_radius) / np.maximum(1.0 + 3.0 * square, 0.1)
+        radius = np.clip(radius - step, 0.0, fold)
+        if np.abs(step).max(initial=0.0) < _UNDISTORT_TOLERANCE:
+            break
     factor = np.where(distorted_radius > 1e-12, radius / np.maximum(distorted_radius, 1e-12), 1.0)
     return x * factor, y * factor
 

@@ -47,6 +47,12 @@ _MAX_CAMERA_RESIDUAL = 0.1
 _SUBMAP_SIGMA = np.array([0.007] * 3 + [0.02] * 3 + [0.02])
 
 
+# An edge to a submap without translations: rotations as far apart as this still agree, and its standard deviations
+# (radians, units of the submap, logarithm of scale) say that position and scale are an assumption.
+_MAX_ROTATION_DISAGREEMENT_DEG = 2.0
+_CARRIED_SIGMA = np.array([0.01] * 3 + [0.5] * 3 + [0.5])
+
+
 @dataclass(frozen=True)
 class AnchorView:
     """One keyframe as one submap sees it."""
@@ -161,6 +167,7 @@ def _ladder(
             ladder.append((name, chosen, _by_points))
     if ladder and spec.kind is ConstraintKind.ADJACENT:
         ladder.append(("cameras", tuple(shared), _by_cameras))
+        ladder.append(("rotation", tuple(shared), _by_rotation))
     return ladder
 
 
@@ -210,6 +217,34 @@ def _by_cameras(
     information = with_floor(information, middle, baseline, 2.0 * _SUBMAP_SIGMA, fix_scale=fix_scale)
     inlier_ratio = float(np.mean(relative <= _MAX_CAMERA_RESIDUAL))
     return _Found(transform, information, inlier_ratio, float(np.median(relative)), len(frames))
+
+
+def _by_rotation(
+    frames: Sequence[SharedFrame], _shared: Sequence[SharedFrame], _config: RegistrationConfig, fix_scale: bool
+) -> _Found:
+    """Align where one side knows rotations only: the camera stands where it last was, and the unit is carried over."""
+    if not any(all(_has_turned_only(frames, side)) for side in ("in_i", "in_j")):
+        raise RegistrationError("both submaps know translations")
+    in_i, in_j = (np.array([getattr(f, side).submap_from_camera for f in frames]) for side in ("in_i", "in_j"))
+    rotation = mean_rotation(in_i, in_j)
+    traces = np.einsum("ab,kbc,kac->k", rotation, in_i[:, :3, :3], in_j[:, :3, :3])
+    agreeing = np.degrees(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0))) <= _MAX_ROTATION_DISAGREEMENT_DEG
+    # the last shared frame, because what follows goes on from there
+    centre_j = in_j[-1, :3, 3]
+    transform = Sim3(rotation, centre_j - rotation @ in_i[-1, :3, 3], 1.0)
+    information = with_floor(1e12 * np.eye(7), centre_j, 1.0, _CARRIED_SIGMA, fix_scale=fix_scale)
+    return _Found(transform, information, float(agreeing.mean()), 0.0, len(frames))
+
+
+def _has_turned_only(frames: Sequence[SharedFrame], side: str) -> list[bool]:
+    """Per shared frame, whether this submap holds it without any depth, where it holds the first one."""
+    first: AnchorView = getattr(frames[0], side)
+    views: list[AnchorView] = [getattr(frame, side) for frame in frames]
+    return [
+        not view.confidence.any()
+        and np.allclose(view.submap_from_camera[:3, 3], first.submap_from_camera[:3, 3], rtol=0.0, atol=1e-9)
+        for view in views
+    ]
 
 
 def _valid_pixels(frame: SharedFrame, config: RegistrationConfig) -> npt.NDArray[np.bool_]:

@@ -47,16 +47,18 @@ SUBMAP_PART_FIRST_HALF: SubmapPart
 SUBMAP_PART_SECOND_HALF: SubmapPart
 
 class FocalHint(_message.Message):
-    __slots__ = ("focal_over_width", "relative_sigma", "radial_k1", "is_fixed")
+    __slots__ = ("focal_over_width", "relative_sigma", "radial_k1", "is_fixed", "intrinsics")
     FOCAL_OVER_WIDTH_FIELD_NUMBER: _ClassVar[int]
     RELATIVE_SIGMA_FIELD_NUMBER: _ClassVar[int]
     RADIAL_K1_FIELD_NUMBER: _ClassVar[int]
     IS_FIXED_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     focal_over_width: float
     relative_sigma: float
     radial_k1: float
     is_fixed: bool
-    def __init__(self, focal_over_width: _Optional[float] = ..., relative_sigma: _Optional[float] = ..., radial_k1: _Optional[float] = ..., is_fixed: bool = ...) -> None: ...
+    intrinsics: _common_pb2.Intrinsics
+    def __init__(self, focal_over_width: _Optional[float] = ..., relative_sigma: _Optional[float] = ..., radial_k1: _Optional[float] = ..., is_fixed: bool = ..., intrinsics: _Optional[_Union[_common_pb2.Intrinsics, _Mapping]] = ...) -> None: ...
 
 class ZeroMotionCopy(_message.Message):
     __slots__ = ("copy_keyframe_id", "original_keyframe_id")

@@ -183,6 +183,7 @@ _FOCAL_HINT = plan(
         "relative_sigma": Real(0.0, allow_infinite=True),
         "radial_k1": NUMBER,
         "is_fixed": Flag(),
+        "intrinsics": Sub(_INTRINSICS, optional=True),
     },
 )
 SUBMAP_SPEC = plan(

@@ -38,7 +38,14 @@ class Placed:
 
 
 def place(
-    tracks: Tracks, positions: Sequence[int], width_px: int, height_px: int, focal_px: float, is_known: bool, seed: int
+    tracks: Tracks,
+    positions: Sequence[int],
+    width_px: int,
+    height_px: int,
+    focal_px: float,
+    principal_px: tuple[float, float],
+    is_known: bool,
+    seed: int,
 ) -> Placed | None:
     """Place the frames; the same input gives the same bits (one thread, every seed set).
 
@@ -48,6 +55,7 @@ def place(
         width_px: image width.
         height_px: image height.
         focal_px: start value.
+        principal_px: principal point relative to the middle of the image.
         is_known: whether it may be trusted; if not it is calibrated from the fundamental matrices first.
         seed: of everything random.
 
@@ -59,7 +67,7 @@ def place(
     pycolmap.set_random_seed(seed)
     with tempfile.TemporaryDirectory(prefix="vggt-motion-sfm-") as folder:
         path = Path(folder) / "submap.db"
-        _write_database(pycolmap, path, tracks, positions, width_px, height_px, focal_px, is_known, seed)
+        _write_database(pycolmap, path, tracks, positions, width_px, height_px, focal_px, principal_px, is_known, seed)
         output = Path(folder) / "models"
         output.mkdir()
         try:
@@ -91,11 +99,14 @@ def _write_database(
     width_px: int,
     height_px: int,
     focal_px: float,
+    principal_px: tuple[float, float],
     is_known: bool,
     seed: int,
 ) -> None:
     model = pycolmap.CameraModelId.SIMPLE_PINHOLE
     camera = pycolmap.Camera.create_from_model_id(1, model, focal_px, width_px, height_px)
+    camera.principal_point_x += principal_px[0]
+    camera.principal_point_y += principal_px[1]
     camera.has_prior_focal_length = is_known
     rows = {position: np.flatnonzero(tracks.frame == position) for position in positions}
     # COLMAP has the corner of the first pixel at the origin, we its centre

@@ -39,11 +39,14 @@ def reduce_image(image: npt.NDArray[np.uint8], width_px: int, height_px: int) ->
 
 
 def prepare(
-    images: Sequence[KeyframeImage], ego_mask: npt.NDArray[np.bool_] | None, max_width_px: int
+    images: Sequence[KeyframeImage],
+    ego_mask: npt.NDArray[np.bool_] | None,
+    max_width_px: int,
+    fx_over_fy: float = 1.0,
 ) -> WorkingImages:
-    """Grey working images of the keyframes, all of the first one's size."""
+    """Grey working images of the keyframes, all of the first one's size, with square pixels."""
     height, width = images[0].pixels.shape[:2]
-    working_width, working_height = fitted_size(width, height, max_width_px)
+    working_width, working_height = fitted_size(width, max(1, round(height * fx_over_fy)), max_width_px)
     grey = tuple(
         reduce_image(
             np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY), dtype=np.uint8), working_width, working_height

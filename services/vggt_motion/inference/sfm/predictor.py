@@ -6,6 +6,7 @@ import functools
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,8 @@ import numpy.typing as npt
 
 from vggt_motion.config import InferenceConfig
 from vggt_motion.geometry import se3
-from vggt_motion.geometry.projection import Intrinsics
+from vggt_motion.geometry.projection import Intrinsics, undistort_rays
+from vggt_motion.inference.given import given_hint
 from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints
 from vggt_motion.inference.sfm import depth as dense
 from vggt_motion.inference.sfm import globalmap, images, relocate, rotation, structure, tracks, verdict
@@ -31,6 +33,11 @@ _MIN_MATCHES = 12
 _MATCH_REACH = 4  # keyframes that are matched with each other at most so far apart
 _STILL_PX = 1.0  # matches that a rotation explains this well carry no parallax
 _FALLBACK_FOCAL_OVER_WIDTH = 0.9
+_DOUBTFUL_CONFIDENCE = 0.6  # of a doubtful submap: only its best points are left to the map
+_PART_RELATIVE_SIGMA = 0.01  # of the focal length that the whole submap saw, for its parts
+_NO_DEPTH = "the camera did not move enough to see any depth"
+_MAX_VANISHED = 0.35  # share of the image that may lose its points over a step while the camera only turns
+_COMPANION_PX = 3.0
 _MIN_SIDE_PX = 48  # smaller images have no room for windows and pyramids
 
 
@@ -79,7 +86,8 @@ class _Submap:
         self._config = config
         self._keyframes = keyframes
         self._hints = hints
-        self._hint = _effective_hint(config, hints.focal)
+        height, width = keyframes[0].pixels.shape[:2] if keyframes else (1, 1)
+        self._hint = given_hint(config, width, height) or hints.focal
         self._seconds: dict[str, float] = {}
         self._attempts: list[str] = []
 
@@ -95,7 +103,10 @@ class _Submap:
             return self._failed(f"the keyframes are smaller than {_MIN_SIDE_PX} px")
         # 2. correspondences
         started = time.perf_counter()
-        working = images.prepare(self._keyframes, self._hints.ego_mask, self._config.sfm.width_px)
+        known = self._hint.intrinsics if self._hint is not None else None
+        if known is not None and not (0.0 <= known.cx < known.width_px and 0.0 <= known.cy < known.height_px):
+            return self._failed(f"the given principal point lies outside of {known.width_px} x {known.height_px} px")
+        working = self._working()
         if len(originals) == 1:
             over_width = self._hint.focal_over_width if self._hint is not None else _FALLBACK_FOCAL_OVER_WIDTH
             standing = rotation.RotationFit({originals[0]: np.eye(3)}, over_width * working.width_px, 0.0)
@@ -104,33 +115,52 @@ class _Submap:
         self._seconds["tracks_s"] = time.perf_counter() - started
         # 3. is there parallax at all
         started = time.perf_counter()
-        matched = _matched(followed, originals, working)
+        matched = _matched(followed, originals, self._assumed_camera(working))
         if all(len(pair[0]) < _MIN_MATCHES for pair in matched.values()):
             return self._failed("too few correspondences between the keyframes: no texture, or no common view")
         focal_px = self._hint.focal_over_width * working.width_px if self._hint is not None else None
         turned = rotation.fit_rotations(matched, originals, focal_px, working.width_px)
         self._seconds["rotation_s"] = time.perf_counter() - started
+        has_companion = False
         if turned is not None and turned.residual_px < _STILL_PX:
-            return self._rotation_only(turned, working)
+            vanished = tracks.vanished_share(followed, originals, working.width_px)
+            if vanished < _MAX_VANISHED:
+                return self._rotation_only(turned, working)
+            # what stays where it is fills the view and moves along, as a truck ahead: look at the rest
+            has_companion = True
+            followed = self._without_companions(turned, originals, working)
         # 4. structure
         started = time.perf_counter()
-        solved, doubt = self._solve(followed, originals, working)
+        first, attempts = structure.solve(followed, originals, working, self._prior())
+        self._attempts.extend(attempts)
+        if first is not None:
+            joined = self._solve_in_parts(first, followed, originals, working)
+            if joined is not None:
+                return replace(joined, stage_seconds=self._seconds | {"parts_s": time.perf_counter() - started})
+        solved, doubt = self._solve(first, originals, working)
         self._seconds["structure_s"] = time.perf_counter() - started
         if solved is None:
             return self._failed("structure from motion found no scene that the keyframes agree on")
         judgement, reason = verdict.judge(solved, len(originals))
         if judgement is SubmapVerdict.FAILED:
             return self._failed(reason)
+        if has_companion:
+            doubt = "; ".join(part for part in (doubt, "something that moves along fills the view") if part)
         if doubt:
             judgement, reason = SubmapVerdict.LOW_QUALITY, "; ".join(part for part in (reason, doubt) if part)
-        # 5. depth
+        # 5. depth, and the frames in which the camera only turned
         started = time.perf_counter()
         frames = self._frames(solved, working)
+        turned_frames = self._turned_frames(frames, followed, originals, solved, working)
         self._seconds["depth_s"] = time.perf_counter() - started
+        if turned_frames:
+            frames = tuple(sorted((*frames, *turned_frames), key=lambda frame: frame.position))
+            doubt = f"{len(turned_frames)} keyframes are known by rotation alone"
+            judgement, reason = SubmapVerdict.LOW_QUALITY, "; ".join(part for part in (reason, doubt) if part)
         return self._prediction(frames, judgement, reason, self._quality(solved, len(frames), working))
 
     def _solve(
-        self, followed: tracks.Tracks, originals: Sequence[int], working: images.WorkingImages
+        self, solved: structure.Structure | None, originals: Sequence[int], working: images.WorkingImages
     ) -> tuple[structure.Structure | None, str]:
         """The structure, and what speaks against it beside its own quality.
 
@@ -138,8 +168,6 @@ class _Submap:
         have little in common but the images, so that their agreement means something.
         """
         prior, count = self._prior(), len(originals)
-        solved, attempts = structure.solve(followed, originals, working, prior)
-        self._attempts.extend(attempts)
         if solved is not None and verdict.is_convincing(solved, count):
             return solved, ""
         candidates = [solved]
@@ -158,6 +186,92 @@ class _Submap:
             return found[0], f"ways to solve it disagree by {apart:.0%} of the path"
         return found[0], ""
 
+    def _solve_in_parts(
+        self,
+        solved: structure.Structure,
+        followed: tracks.Tracks,
+        originals: Sequence[int],
+        working: images.WorkingImages,
+    ) -> Prediction | None:
+        """Solve driving and turning on the spot apart, where the submap holds both; None where it does not.
+
+        While the camera only turns nothing carries the scale from what leaves the view to what comes into it, though a
+        bundle adjustment finds some. What comes after is put where the camera stands, in the unit of its own steps.
+        """
+        camera = _intrinsics(solved.scene, working)
+        parts = rotation.split(_matched(followed, originals, camera), originals, camera.fx, _STILL_PX)
+        if not any(part.is_turning for part in parts):
+            return None
+        hint = self._hint
+        if hint is None or not hint.is_fixed:
+            hint = FocalHint(solved.focal_over_width, _PART_RELATIVE_SIGMA, solved.scene.radial_k1)
+        placed: dict[int, PredictedFrame] = {}
+        qualities = []
+        for part in parts:
+            inner = _Submap(
+                self._config, [self._keyframes[p] for p in part.positions], PredictionHints(hint, self._hints.ego_mask)
+            )
+            found = inner.predict_turning() if part.is_turning else inner.predict()
+            kind = "turning on the spot" if part.is_turning else "moving"
+            name = f"keyframes {part.positions[0]} to {part.positions[-1]}, {kind}"
+            self._attempts.extend(f"{name}: {line}" for line in (found.verdict.value, *found.quality.attempts))
+            frames = {part.positions[frame.position]: frame for frame in found.frames}
+            border = part.positions[0]
+            if placed and (border not in frames or border not in placed):
+                break
+            joined_from_part = np.eye(4)
+            if placed:
+                joined_from_part = placed[border].submap_from_camera @ se3.inverse(frames[border].submap_from_camera)
+            for position, frame in frames.items():
+                pose = joined_from_part @ frame.submap_from_camera
+                moved = replace(frame, position=position, submap_from_camera=pose)
+                if position not in placed or not placed[position].confidence.any():
+                    placed[position] = moved
+            if not part.is_turning:
+                qualities.append(found.quality)
+        if not placed:
+            return None
+        everywhere = tuple(
+            replace(placed[original], position=position)
+            for position in range(len(self._keyframes))
+            if (original := self._original(position)) in placed
+        )
+        if not qualities:
+            return self._prediction(everywhere, SubmapVerdict.ROTATION_ONLY, _NO_DEPTH, found.quality)
+        quality = SubmapQuality(
+            registered_frame_count=len(everywhere),
+            mean_reprojection_error_px=float(np.nanmax([q.mean_reprojection_error_px for q in qualities])),
+            track_inlier_ratio=min(q.track_inlier_ratio for q in qualities),
+            median_parallax_deg=float(np.nanmin([q.median_parallax_deg for q in qualities])),
+            focal_over_width=hint.focal_over_width,
+            focal_relative_sigma=math.inf,
+            radial_k1=hint.radial_k1,
+            attempts=tuple(self._attempts),
+        )
+        reason = "the camera turned on the spot: the scale after it is carried over, not measured"
+        return self._prediction(everywhere, SubmapVerdict.LOW_QUALITY, reason, quality)
+
+    def _without_companions(
+        self, turned: rotation.RotationFit, originals: Sequence[int], working: images.WorkingImages
+    ) -> tracks.Tracks:
+        """Matched features without those that a rotation explains."""
+        matched = tracks.match(working, originals)
+        camera = replace(self._assumed_camera(working), fx=turned.focal_px, fy=turned.focal_px)
+        companions = rotation.explained(matched, turned, camera, _COMPANION_PX)
+        self._attempts.append(f"what a rotation explains left out: {companions.mean():.0%} of the matched features")
+        return matched.without(companions)
+
+    def predict_turning(self) -> Prediction:
+        """The prediction for a camera that is known to have turned on the spot."""
+        working = self._working()
+        originals = range(len(self._keyframes))
+        camera = self._assumed_camera(working)
+        matched = _matched(tracks.follow(working, originals), originals, camera)
+        turned = rotation.fit_rotations(matched, originals, camera.fx, working.width_px)
+        if turned is None:
+            return self._failed("the keyframes of a turn are not connected")
+        return self._rotation_only(turned, working)
+
     def _mapped(
         self, matched: tracks.Tracks, originals: Sequence[int], working: images.WorkingImages, prior: CameraPrior
     ) -> structure.Structure | None:
@@ -169,6 +283,7 @@ class _Submap:
             working.width_px,
             working.height_px,
             known * working.width_px,
+            prior.principal_px(working.width_px),
             prior.is_sure,
             self._config.sfm.seed,
         )
@@ -182,7 +297,28 @@ class _Submap:
         hint = self._hint
         if hint is None:
             return CameraPrior()
-        return CameraPrior(hint.focal_over_width, hint.relative_sigma, hint.radial_k1, hint.is_fixed)
+        known = hint.intrinsics
+        if known is None:
+            return CameraPrior(hint.focal_over_width, hint.relative_sigma, hint.radial_k1, hint.is_fixed)
+        # the working images have square pixels of the width of the recorded ones
+        principal = (
+            (known.cx - 0.5 * (known.width_px - 1)) / known.width_px,
+            (known.cy - 0.5 * (known.height_px - 1)) * known.fx / known.fy / known.width_px,
+        )
+        return CameraPrior(hint.focal_over_width, hint.relative_sigma, hint.radial_k1, hint.is_fixed, principal)
+
+    def _working(self) -> images.WorkingImages:
+        known = self._hint.intrinsics if self._hint is not None else None
+        aspect = known.fx / known.fy if known is not None else 1.0
+        return images.prepare(self._keyframes, self._hints.ego_mask, self._config.sfm.width_px, aspect)
+
+    def _assumed_camera(self, working: images.WorkingImages, focal_over_width: float | None = None) -> Intrinsics:
+        """The camera of the working images before anything is solved, its focal length guessed where none is known."""
+        prior = self._prior()
+        assumed = focal_over_width or prior.focal_over_width or _FALLBACK_FOCAL_OVER_WIDTH
+        u, v = prior.principal_px(working.width_px)
+        middle = Intrinsics.centred(assumed * working.width_px, working.width_px, working.height_px, prior.radial_k1)
+        return replace(middle, cx=middle.cx + u, cy=middle.cy + v)
 
     def _frames(self, solved: structure.Structure, working: images.WorkingImages) -> tuple[PredictedFrame, ...]:
         width, height = images.fitted_size(working.width_px, working.height_px, self._config.sfm.depth_width_px)
@@ -225,6 +361,31 @@ class _Submap:
                 )
         return tuple(frames)
 
+    def _turned_frames(
+        self,
+        frames: Sequence[PredictedFrame],
+        followed: tracks.Tracks,
+        originals: Sequence[int],
+        solved: structure.Structure,
+        working: images.WorkingImages,
+    ) -> list[PredictedFrame]:
+        """Frames that the structure does not hold because the camera turned on the spot: pose, but no depth."""
+        camera = _intrinsics(solved.scene, working)
+        matched = _matched(followed, originals, camera)
+        extended = rotation.extend(solved.camera_from_submap(), matched, originals, camera.fx, _STILL_PX)
+        if not extended:
+            return []
+        self._attempts.append(f"rotation alone: {len(extended)} more keyframes, from their neighbours")
+        sample = frames[0]
+        nothing = np.zeros_like(sample.depth)
+        return [
+            PredictedFrame(
+                position, nothing, nothing, sample.intrinsics, se3.inverse(extended[self._original(position)])
+            )
+            for position in range(len(self._keyframes))
+            if self._original(position) in extended
+        ]
+
     def _original(self, position: int) -> int:
         """The keyframe whose pose a keyframe shares: itself, or the other end of a stop."""
         copies = self._hints.zero_motion_copies
@@ -250,8 +411,7 @@ class _Submap:
             over_width = self._hint.focal_over_width
         else:
             over_width = turned.focal_px / working.width_px if turned.shows_focal else _FALLBACK_FOCAL_OVER_WIDTH
-        k1 = self._hint.radial_k1 if self._hint is not None else 0.0
-        intrinsics = Intrinsics.centred(over_width * width, width, height, k1)
+        intrinsics = self._assumed_camera(working, over_width).resized(width, height)
         nothing = np.zeros((height, width), dtype=np.float32)
         frames = []
         for position in range(len(self._keyframes)):
@@ -270,12 +430,10 @@ class _Submap:
             median_parallax_deg=0.0,
             focal_over_width=over_width,
             focal_relative_sigma=math.inf,
-            radial_k1=self._hint.radial_k1 if self._hint is not None else 0.0,
+            radial_k1=intrinsics.k1,
             attempts=tuple(self._attempts),
         )
-        return self._prediction(
-            tuple(frames), SubmapVerdict.ROTATION_ONLY, "the camera did not move enough to see any depth", quality
-        )
+        return self._prediction(tuple(frames), SubmapVerdict.ROTATION_ONLY, _NO_DEPTH, quality)
 
     def _failed(self, reason: str) -> Prediction:
         over_width = self._hint.focal_over_width if self._hint is not None else _FALLBACK_FOCAL_OVER_WIDTH
@@ -285,14 +443,9 @@ class _Submap:
     def _prediction(
         self, frames: tuple[PredictedFrame, ...], judgement: SubmapVerdict, reason: str, quality: SubmapQuality
     ) -> Prediction:
+        if judgement is SubmapVerdict.LOW_QUALITY:
+            frames = tuple(replace(f, confidence=_DOUBTFUL_CONFIDENCE * f.confidence) for f in frames)
         return Prediction(frames, judgement, reason, ScaleKind.RELATIVE, _MODEL, quality, dict(self._seconds))
-
-
-def _effective_hint(config: InferenceConfig, hint: FocalHint | None) -> FocalHint | None:
-    """The user's intrinsics, where given, before the running estimate."""
-    if config.focal_over_width is not None:
-        return FocalHint(config.focal_over_width, 0.0, config.radial_k1 or 0.0, is_fixed=True)
-    return hint
 
 
 def _loop_outcome(position: int, located: relocate.Located | None) -> str:
@@ -301,16 +454,21 @@ def _loop_outcome(position: int, located: relocate.Located | None) -> str:
     return f"loop keyframe {position}: found again, {located.inlier_share:.0%} of the matches agree"
 
 
-def _matched(
-    followed: tracks.Tracks, positions: Sequence[int], working: images.WorkingImages
-) -> dict[Pair, tuple[Array, Array]]:
-    """Pairs of frames not far apart -> the points that both see, relative to the middle of the image."""
-    centre = np.array([0.5 * (working.width_px - 1), 0.5 * (working.height_px - 1)])
+def _matched(followed: tracks.Tracks, positions: Sequence[int], camera: Intrinsics) -> dict[Pair, tuple[Array, Array]]:
+    """Pairs of frames not far apart -> the points that both see, as a camera without distortion would see them.
+
+    Pixels are relative to the principal point.
+    """
+
+    def straight(pixel: Array) -> Array:
+        x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
+        return camera.fx * np.stack(undistort_rays(x, y, camera.k1), axis=1)
+
     matched = {}
     for index, a in enumerate(positions):
         for b in positions[index + 1 : index + 1 + _MATCH_REACH]:
             _, at_a, at_b = followed.between(a, b)
-            matched[a, b] = (at_a - centre, at_b - centre)
+            matched[a, b] = (straight(at_a), straight(at_b))
     return matched
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from vggt_motion.geometry.projection import Intrinsics
 from vggt_motion.geometry.se3 import nearest_rotation
+from vggt_motion.inference.sfm.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
 Pair = tuple[int, int]
@@ -18,6 +21,7 @@ _FOCAL_GRID = (0.9, 0.4, 0.6, 1.3, 2.0, 3.0)  # focal length / image width, the 
 _HOPELESS_PX = 10.0  # no other focal length brings such residuals down to nothing
 _TELLING_TURN_DEG = 10.0
 _ITERATIONS = 8
+_WINDOW_STEPS = 3  # over which a slow motion shows
 _MIN_MATCHES = 12
 
 
@@ -84,6 +88,101 @@ def fit_rotations(
         if residual > _HOPELESS_PX:
             break
     return best
+
+
+def extend(
+    camera_from_submap: Mapping[int, Array],
+    matched: Mapping[Pair, tuple[Array, Array]],
+    positions: Sequence[int],
+    focal_px: float,
+    max_residual_px: float,
+) -> dict[int, Array]:
+    """Poses of frames that only turned against a neighbour of known pose: they stand where it stands.
+
+    Args:
+        camera_from_submap: (4, 4) of the frames that are known.
+        matched: as for :func:`fit_rotations`.
+        positions: all frames in time order.
+        focal_px: of the matched points.
+        max_residual_px: median residual up to which a rotation explains the matches.
+
+    Returns:
+        (4, 4) of the frames that were added.
+    """
+    known = dict(camera_from_submap)
+    for order in (list(positions), list(positions)[::-1]):
+        for before, position in itertools.pairwise(order):
+            if position in known or before not in known:
+                continue
+            pair = (min(before, position), max(before, position))
+            points = matched.get(pair)
+            if points is None or len(points[0]) < _MIN_MATCHES:
+                continue
+            b_from_a, residuals = fit_rotation(points[0], points[1], focal_px)
+            if float(np.median(residuals)) >= max_residual_px:
+                continue
+            turn = np.eye(4)
+            turn[:3, :3] = b_from_a if before < position else b_from_a.T
+            known[position] = turn @ known[before]
+    return {position: pose for position, pose in known.items() if position not in camera_from_submap}
+
+
+def explained(tracks: Tracks, turned: RotationFit, camera: Intrinsics, within_px: float) -> npt.NDArray[np.bool_]:
+    """Points (count,) whose first and last sight differ by the rotation alone."""
+    if tracks.count == 0:
+        return np.zeros(0, dtype=np.bool_)
+    middle = np.array([camera.cx, camera.cy])
+    first = np.searchsorted(tracks.point, np.arange(tracks.count), side="left")
+    last = np.searchsorted(tracks.point, np.arange(tracks.count), side="right") - 1
+    rotations = np.stack([turned.camera_from_submap[int(frame)] for frame in tracks.frame])
+    last_from_first = np.einsum("kab,kcb->kac", rotations[last], rotations[first])
+    rays = np.einsum("kab,kb->ka", last_from_first, _rays(tracks.pixel[first] - middle, camera.fx))
+    depth = np.maximum(rays[:, 2:], 1e-3)
+    errors = np.linalg.norm(rays[:, :2] / depth * camera.fx - (tracks.pixel[last] - middle), axis=1)
+    return np.asarray(errors < within_px)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a submap; neighbours share the frame at their border."""
+
+    positions: tuple[int, ...]
+    is_turning: bool  # on the spot
+
+
+def split(
+    matched: Mapping[Pair, tuple[Array, Array]], positions: Sequence[int], focal_px: float, max_residual_px: float
+) -> list[Part]:
+    """Part the frames where the camera moved from those where it only turned, and far enough to lose what it saw.
+
+    Arguments as for :func:`extend`.
+    """
+    count = len(positions)
+    is_turning = [False] * (count - 1)
+    judged_by = [0] * (count - 1)  # steps of the widest window that says anything about a step
+    turns = np.zeros(count - 1)
+    for reach in range(min(_WINDOW_STEPS, count - 1), 0, -1):
+        for first in range(count - reach):
+            points = matched.get((positions[first], positions[first + reach]))
+            if points is None or len(points[0]) < _MIN_MATCHES:
+                continue
+            b_from_a, residuals = fit_rotation(points[0], points[1], focal_px)
+            if reach == 1:
+                turns[first] = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(b_from_a) - 1.0), -1.0, 1.0))))
+            for step in range(first, first + reach):
+                if judged_by[step] in (0, reach):
+                    judged_by[step] = reach
+                    is_turning[step] = is_turning[step] or float(np.median(residuals)) < max_residual_px
+    parts: list[Part] = []
+    begin = 0
+    for turning, group in itertools.groupby(range(count - 1), key=lambda step: is_turning[step]):
+        end = max(group) + 1
+        far = turning and float(turns[begin:end].sum()) > _TELLING_TURN_DEG
+        if parts and parts[-1].is_turning == far:
+            begin = positions.index(parts.pop().positions[0])
+        parts.append(Part(tuple(positions[begin : end + 1]), far))
+        begin = end
+    return parts
 
 
 def _chain(b_from_a: Mapping[Pair, Array], positions: Sequence[int]) -> dict[int, Array] | None:

@@ -128,7 +128,14 @@ def solve_from(
     registered = np.array([position in placed.camera_from_submap for position in positions])
     poses = np.stack([placed.camera_from_submap.get(position, np.eye(4)) for position in positions])
     nothing = np.zeros((0, 3))
-    scene = Scene(poses[:, :3, :3].copy(), poses[:, :3, 3].copy(), nothing, placed.focal_px, prior.radial_k1)
+    scene = Scene(
+        poses[:, :3, :3].copy(),
+        poses[:, :3, 3].copy(),
+        nothing,
+        placed.focal_px,
+        prior.radial_k1,
+        *prior.principal_px(working.width_px),
+    )
     calibration = prior.calibration(working.width_px)
     solved = _adjusted(observations, registered, positions, working.width_px, scene, calibration)
     if solved is not None:
@@ -221,7 +228,14 @@ def _from_start(
     focal_over_width: float,
 ) -> Structure | None:
     nothing = np.zeros((0, 3))
-    camera = Scene(np.zeros((0, 3, 3)), nothing, nothing, focal_over_width * width_px, prior.radial_k1)
+    camera = Scene(
+        np.zeros((0, 3, 3)),
+        nothing,
+        nothing,
+        focal_over_width * width_px,
+        prior.radial_k1,
+        *prior.principal_px(width_px),
+    )
     grown = growth.grow(observations, len(positions), camera, calibration)
     if grown is None:
         return None

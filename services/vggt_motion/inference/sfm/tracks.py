@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -29,6 +29,8 @@ _WINDOW_PX = 15
 _PYRAMID_LEVELS = 1
 _ROUND_TRIP_PX = 0.7
 _BORDER_PX = 4
+_CELLS_ACROSS = 10
+_MIN_IN_CELL = 3
 _MIN_FOLLOWED = 130  # fewer tracks over a step are helped out by feature matches
 _SAME_POINT_PX = 1.0
 _MIN_EPIPOLAR_MATCHES = 16
@@ -43,12 +45,45 @@ class Tracks:
     frame: Index  # (O,) position of the keyframe
     pixel: Array  # (O, 2)
     count: int
+    lost_frame: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (L,) last frame of what got lost
+    lost_pixel: Array = field(
+        default_factory=lambda: np.zeros((0, 2))
+    )  # (L, 2) where it was; corners never followed too
 
     def between(self, a: int, b: int) -> tuple[Index, Array, Array]:
         """Points seen in both frames, and where: indices (M,), pixels (M, 2) in ``a`` and in ``b``."""
         in_a, in_b = np.flatnonzero(self.frame == a), np.flatnonzero(self.frame == b)
         shared, at_a, at_b = np.intersect1d(self.point[in_a], self.point[in_b], assume_unique=True, return_indices=True)
         return shared, self.pixel[in_a[at_a]], self.pixel[in_b[at_b]]
+
+    def without(self, points: npt.NDArray[np.bool_]) -> Tracks:
+        """The tracks but for some points (count,)."""
+        number = np.cumsum(~points) - 1
+        kept = ~points[self.point]
+        return Tracks(number[self.point[kept]], self.frame[kept], self.pixel[kept], int((~points).sum()))
+
+
+def vanished_share(tracks: Tracks, positions: Sequence[int], width_px: int) -> float:
+    """Share of the image's parts that lose most of their points over a step between frames (median over the steps).
+
+    A camera that only turns keeps what it sees, but for what leaves at the side; one that drives behind a truck loses
+    nearly everything but the truck.
+    """
+    shares = []
+    cell_px = width_px / _CELLS_ACROSS
+    for a, b in itertools.pairwise(positions):
+        _, kept, _ = tracks.between(a, b)
+        lost = tracks.lost_pixel[tracks.lost_frame == a]
+        cells = np.floor(np.concatenate([kept, lost]) / cell_px).astype(np.int64)
+        if not len(cells):
+            continue
+        _, index = np.unique(cells, axis=0, return_inverse=True)
+        total = np.bincount(index.ravel())
+        gone = np.bincount(index.ravel()[len(kept) :], minlength=len(total))
+        counted = total >= _MIN_IN_CELL
+        if counted.any():
+            shares.append(float((gone[counted] > 0.5 * total[counted]).mean()))
+    return float(np.median(shares)) if shares else 0.0
 
 
 def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
@@ -60,6 +95,7 @@ def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
     pixels = np.zeros((0, 2), dtype=np.float32)
     next_id = 0
     rows: list[tuple[Index, int, Points]] = []
+    lost: list[tuple[int, Points]] = []
     for a, b in itertools.pairwise(positions):
         fresh = _corners(working.grey[a], working.usable, pixels)
         ids = np.concatenate([ids, np.arange(next_id, next_id + len(fresh))])
@@ -73,6 +109,7 @@ def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
         nearest = np.rint(np.where(inside[:, None], moved, 0.0)).astype(np.int64)
         kept &= working.usable[nearest[:, 1], nearest[:, 0]]
         followed, landed = ids[kept], moved[kept]
+        lost.append((a, pixels[~kept]))
         rows.append((followed, b, landed))
         if len(followed) < _MIN_FOLLOWED:
             # too large a step for tracking: features do not care how far they moved
@@ -82,7 +119,11 @@ def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
             next_id += len(new_at_a)
             followed, landed = np.concatenate([followed, matched_ids]), np.concatenate([landed, at_b])
         ids, pixels = followed, landed
-    return _assemble(rows)
+    return replace(
+        _assemble(rows),
+        lost_frame=np.concatenate([np.full(len(where), a, dtype=np.int64) for a, where in lost]),
+        lost_pixel=np.concatenate([where for _, where in lost]).astype(np.float64),
+    )
 
 
 def match(working: WorkingImages, positions: Sequence[int], reach: int = 4) -> Tracks:
