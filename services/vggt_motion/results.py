@@ -36,7 +36,7 @@ from vggt_motion.evaluation.report_data import (
     empty_track,
 )
 from vggt_motion.evaluation.summary import error_table, is_kitti
-from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_kitti, to_tum
+from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_csv, to_kitti, to_tum
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.geometry.track import PoseTrack
 from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, ScaleKind, SubmapVerdict
@@ -144,6 +144,7 @@ def write_results(
         _write(out / "trajectory_keyframes.tum", to_tum(trajectory.track("key")))
         _write(out / "trajectory_frames.tum", to_tum(trajectory.track("all")))
         _write(out / "trajectory_frames.kitti", to_kitti(trajectory.track("all")))
+        _write(out / "trajectory_frames.csv", to_csv(trajectory))
         if cloud is not None:
             cloud.write_ply(out / "map.ply")
         write_report(out, data)
@@ -185,7 +186,8 @@ def _component_track(frames: tuple[TrajectoryPose, ...]) -> ComponentTrack:
         np.array([frame.capture_time_ns for frame in posed], dtype=np.int64),
         np.array([frame.world_from_camera for frame in posed], dtype=np.float64),
     )
-    return ComponentTrack(track, np.array([frame.component for frame in posed], dtype=np.int64))
+    doubtful = [frame.verdict not in (None, SubmapVerdict.GOOD) for frame in posed]
+    return ComponentTrack(track, np.array([frame.component for frame in posed], dtype=np.int64), np.array(doubtful))
 
 
 def _camera_view(
@@ -250,7 +252,7 @@ def _metrics(
     state: LogState, trajectory: Trajectory, facts: RunFacts, component: int, *, has_metres: bool
 ) -> dict[str, Any]:
     submaps = state.usable_submaps()
-    verdicts = Counter(_newest_verdicts(state).values())
+    verdicts = Counter(_verdicts(state).values())
     constraints = state.constraints.values()
     graph = state.latest_graph()
     ended = state.stream_ended
@@ -283,15 +285,25 @@ def _metrics(
         "motion_states": dict(sorted(states.items())),
         "focal_over_width": hint.focal_over_width if hint is not None else None,
         "focal_relative_sigma": hint.relative_sigma if hint is not None else None,
+        "video_seconds": _video_seconds(trajectory),
         "wall_seconds": facts.wall_seconds,
         "start_up_seconds": facts.start_up_seconds,
+        "stage_seconds": _stage_seconds(state, facts),
         "restart_count": facts.restart_count,
         "warnings": warnings(state, trajectory),
     }
 
 
-def _newest_verdicts(state: LogState) -> dict[int, SubmapVerdict]:
-    return {index: state.submaps[index, revision].verdict for index, revision in sorted(state.submaps)}
+def _video_seconds(trajectory: Trajectory) -> float:
+    """From the first capture to the last."""
+    times = [frame.capture_time_ns for frame in trajectory.frames]
+    return (max(times) - min(times)) / 1e9 if times else 0.0
+
+
+def _verdicts(state: LogState) -> dict[int, SubmapVerdict]:
+    """Of each submap, the verdict on the revision that the trajectory uses, or on the last one where none is usable."""
+    last = {index: state.submaps[index, revision].verdict for index, revision in sorted(state.submaps)}
+    return last | {index: geometry.verdict for index, geometry in state.usable_submaps().items()}
 
 
 def warnings(state: LogState, trajectory: Trajectory) -> list[str]:
@@ -304,9 +316,11 @@ def warnings(state: LogState, trajectory: Trajectory) -> list[str]:
         lines.append("the camera did not move, or nothing shows that it did: all poses are the same")
     graph = state.latest_graph()
     lines.extend(graph.breaks if graph is not None else ())
-    for index, verdict in _newest_verdicts(state).items():
+    for index, verdict in _verdicts(state).items():
         if verdict is not SubmapVerdict.GOOD:
+            used = state.submap(index)
             reasons = [g.reason for (k, _), g in sorted(state.submaps.items()) if k == index and g.reason]
+            reasons += [used.reason] if used is not None and used.reason else []
             lines.append(
                 f"submap {index} is {verdict.value.replace('_', ' ')}" + (f": {reasons[-1]}" if reasons else "")
             )

@@ -28,6 +28,7 @@ RESULTS = (
     "trajectory_keyframes.tum",
     "trajectory_frames.tum",
     "trajectory_frames.kitti",
+    "trajectory_frames.csv",
     "map.ply",
     "run.mcap",
     "report.html",

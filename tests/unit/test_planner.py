@@ -107,6 +107,7 @@ def run(
     focals: dict[int, float] | None = None,
     sigma: float = 0.02,
     dead_share: float = 0.0,
+    bad_share: float = 0.0,
 ) -> None:
     """Carry out whatever is planned, one job at a time in random order, until nothing is left."""
     for _ in range(10_000):
@@ -115,7 +116,10 @@ def run(
             return
         job = order.choice(jobs)
         is_doomed = zlib.crc32(job.job_id.encode()) % 100 < 100 * dead_share
-        state.apply(dead(job.job_id) if is_doomed else result(job, focals or {}, sigma))
+        done = dead(job.job_id) if is_doomed else result(job, focals or {}, sigma)
+        if isinstance(done, SubmapGeometry) and zlib.crc32(b"bad" + job.job_id.encode()) % 100 < 100 * bad_share:
+            done = replace(done, verdict=SubmapVerdict.LOW_QUALITY, reason="no texture")
+        state.apply(done)
     raise AssertionError("the plan does not end")
 
 
@@ -289,16 +293,71 @@ def test_a_half_that_the_settled_estimate_contradicts_is_predicted_once_more() -
     assert edges(state) == {(0, 2), (2, 3), (3, 4)} | {(2 * k, 2 * k + 2) for k in range(2, 7)}
 
 
-def test_a_failed_submap_is_not_registered() -> None:
+def bad(verdict: SubmapVerdict, spec: SubmapSpec) -> SubmapGeometry:
+    done = replace(geometry(spec), verdict=verdict, reason="no texture")
+    return replace(done, frames=()) if verdict is SubmapVerdict.FAILED else done
+
+
+def test_a_failed_submap_is_tried_again_in_a_wider_view_and_then_not_registered() -> None:
     state = started(3)
     for job in planner.next_jobs(state, CONFIG):
         assert isinstance(job.task, PredictTask)
-        done = geometry(job.task.spec)
-        failed = replace(done, verdict=SubmapVerdict.FAILED, frames=(), reason="no texture")
-        state.apply(failed if job.task.spec.submap_index == 2 else done)
+        spec = job.task.spec
+        state.apply(bad(SubmapVerdict.FAILED, spec) if spec.submap_index == 2 else geometry(spec))
+    (again,) = planner.next_jobs(state, CONFIG)
+    assert isinstance(again.task, PredictTask)
+    assert again.job_id == whole(1, 2)
+    assert again.task.spec.base_keyframe_ids == segment(1).base_keyframe_ids
+    assert again.task.spec.overlap_keyframe_ids == segment(0).base_keyframe_ids  # 4 instead of 2
+    assert again.task.spec.focal_hint is not None
+    assert not planner.is_complete(state, CONFIG)
+    state.apply(bad(SubmapVerdict.FAILED, again.task.spec))
     assert planner.next_jobs(state, CONFIG) == []
     assert planner.is_complete(state, CONFIG)
     assert sorted(state.usable_submaps()) == [0, 4]
+
+
+@pytest.mark.parametrize(
+    ("second", "used"), [(SubmapVerdict.GOOD, 2), (SubmapVerdict.LOW_QUALITY, 2), (SubmapVerdict.ROTATION_ONLY, 1)]
+)
+def test_of_two_predictions_the_better_one_is_used(second: SubmapVerdict, used: int) -> None:
+    state = started(2)
+    for job in planner.next_jobs(state, CONFIG):
+        assert isinstance(job.task, PredictTask)
+        spec = job.task.spec
+        state.apply(bad(SubmapVerdict.LOW_QUALITY, spec) if spec.submap_index == 2 else geometry(spec))
+    again = next(job for job in planner.next_jobs(state, CONFIG) if isinstance(job.task, PredictTask))
+    assert isinstance(again.task, PredictTask)
+    state.apply(replace(geometry(again.task.spec), verdict=second))
+    chosen = state.submap(2)
+    assert chosen is not None and chosen.spec.revision == used
+    run(state, random.Random(0))
+    constraints = planner.current_constraints(state)
+    assert [(c.spec.i_revision, c.spec.j_revision) for c in constraints] == [(1, used)]
+
+
+def test_a_submap_without_anything_before_it_and_one_that_turned_are_not_tried_again() -> None:
+    state = started(2)
+    for job in planner.next_jobs(state, CONFIG):
+        assert isinstance(job.task, PredictTask)
+        verdict = SubmapVerdict.ROTATION_ONLY if job.task.spec.submap_index else SubmapVerdict.LOW_QUALITY
+        state.apply(bad(verdict, job.task.spec))
+    assert not any(isinstance(job.task, PredictTask) for job in planner.next_jobs(state, CONFIG))
+
+
+def test_known_intrinsics_are_in_every_job_and_no_estimate_replaces_them() -> None:
+    config = load_config(assignments=[f"inference.intrinsics.{name}" for name in ("fx=360", "cx=300", "cy=90.5")])
+    state = started(5)
+    jobs = planner.next_jobs(state, config)
+    assert [job.job_id for job in jobs] == [whole(k) for k in range(5)]  # none waits for others
+    for job in jobs:
+        assert isinstance(job.task, PredictTask)
+        hint = job.task.spec.focal_hint
+        assert hint is not None and hint.is_fixed
+        assert hint.focal_over_width == pytest.approx(360 / 620)
+        assert hint.intrinsics == Intrinsics(360.0, 360.0, 300.0, 90.5, 620, 188)
+        state.apply(geometry(job.task.spec, 0.7))
+    assert not any(isinstance(job.task, PredictTask) for job in planner.next_jobs(state, config))
 
 
 def test_not_complete_before_the_input_is_closed() -> None:
@@ -314,17 +373,24 @@ def test_not_complete_before_the_input_is_closed() -> None:
     sigma=st.floats(0.002, 0.3),
     focals=st.dictionaries(st.integers(0, 23), st.floats(0.4, 0.9), max_size=6),
     dead_share=st.sampled_from([0.0, 0.2, 0.6]),
+    bad_share=st.sampled_from([0.0, 0.3]),
     base=st.integers(1, 7),
 )
 def test_the_outcome_does_not_depend_on_who_is_faster(
-    seed: int, count: int, sigma: float, focals: dict[int, float], dead_share: float, base: int
+    seed: int,
+    count: int,
+    sigma: float,
+    focals: dict[int, float],
+    dead_share: float,
+    bad_share: float,
+    base: int,
 ) -> None:
     outcomes = []
     for order in (random.Random(seed), random.Random(seed + 1)):
         state = started(count, base=base, ended=False)
-        run(state, order, focals, sigma, dead_share)
+        run(state, order, focals, sigma, dead_share, bad_share)
         state.apply(started(count, base=base).events["stream_ended"])
-        run(state, order, focals, sigma, dead_share)
+        run(state, order, focals, sigma, dead_share, bad_share)
         assert planner.is_complete(state, CONFIG)
         specs = {key: value.spec for key, value in state.submaps.items()}
         outcomes.append((specs, sorted(state.constraints), sorted(state.dead_jobs)))

@@ -2,6 +2,7 @@
 
 - a segment closed: predict its submap, once the results that its focal hint folds (submaps 0 to k-3) are known;
 - the focal estimate settled: predict submaps that it contradicts once more, as revision 2;
+- a submap came out badly: predict it once more, as revision 2, with the settled estimate and in a wider view;
 - a submap cannot be predicted (its job is dead): predict the two halves of its base, which overlap; where a half is
   dead too, the graph breaks;
 - two neighbours predicted: register them.
@@ -16,6 +17,7 @@ from itertools import pairwise
 from vggt_motion.backend import focal
 from vggt_motion.backend.state import LogState
 from vggt_motion.config import Config
+from vggt_motion.inference.given import given_hint, is_given
 from vggt_motion.records import (
     Constraint,
     ConstraintKind,
@@ -31,6 +33,7 @@ from vggt_motion.records import (
     SubmapPart,
     SubmapQuality,
     SubmapSpec,
+    SubmapVerdict,
     constraint_id,
     submap_id,
     submap_index,
@@ -40,6 +43,10 @@ from vggt_motion.records import (
 HINT_LAG = 3
 # A focal length that is off by more than this share bends a submap visibly.
 MAX_FOCAL_DEVIATION = 0.02
+# A submap that came out badly is tried again together with so many more keyframes before it: a wider baseline, another
+# start, and points that were seen for longer.
+_WIDER_OVERLAP_FACTOR = 2
+_BAD = frozenset({SubmapVerdict.LOW_QUALITY, SubmapVerdict.FAILED})
 # Neighbours with different focal lengths differ by more than a similarity. On a straight road, where nobody knows the
 # focal length, submaps that agree on a wrong one still fit together: so a second prediction keeps to the estimate,
 # however uncertain that is. Measured on 59 m of straight road: 0.04 to 0.05 m ATE with any common value from 0.40 to
@@ -135,19 +142,11 @@ def _quality(state: LogState, composition: _Composition) -> SubmapQuality | None
     return geometry.quality if geometry is not None else None
 
 
-def _given_hint(config: Config) -> FocalHint | None:
-    given = config.inference.focal_over_width
-    if given is None:
-        return None
-    return FocalHint(given, relative_sigma=0.0, radial_k1=config.inference.radial_k1 or 0.0, is_fixed=True)
-
-
 def _predictions(state: LogState, config: Config) -> Iterator[PlannedJob]:
-    given = _given_hint(config)
     estimate = focal.FocalEstimate()
     for index in sorted(state.segments):
         newest = index - HINT_LAG
-        if given is None and newest >= 0:
+        if not is_given(config.inference) and newest >= 0:
             # Only wholes are folded: nobody waits for the halves of a submap that cannot be predicted.
             whole = _whole(state.segments[newest])
             if not _is_resolved(state, whole, 1):
@@ -155,27 +154,48 @@ def _predictions(state: LogState, config: Config) -> Iterator[PlannedJob]:
             estimate.add(_quality(state, whole))
         for composition in _compositions(state, config, state.segments[index]):
             if not _is_resolved(state, composition, 1):
-                yield from _predict_job(state, composition, 1, given or estimate.hint())
+                yield from _predict_job(state, config, composition, 1, estimate.hint())
     for composition, hint in _second_predictions(state, config).items():
         if not _is_resolved(state, composition, 2):
-            yield from _predict_job(state, composition, 2, hint)
+            first = _geometry(state, composition, 1)
+            is_bad = first is not None and first.verdict in _BAD
+            yield from _predict_job(state, config, _wider(state, composition) if is_bad else composition, 2, hint)
 
 
-def _second_predictions(state: LogState, config: Config) -> dict[_Composition, FocalHint]:
-    """Submaps whose focal length is contradicted by the estimate at the moment that it settled, with that estimate."""
-    decision = _settled_estimate(state) if config.inference.focal_over_width is None else None
-    if decision is None:
-        return {}
-    settled_at, estimate = decision
-    hint = replace(estimate, relative_sigma=min(estimate.relative_sigma, CONSENSUS_RELATIVE_SIGMA))
-    contradicted = {}
+def _second_predictions(state: LogState, config: Config) -> dict[_Composition, FocalHint | None]:
+    """Submaps that are predicted once more, and with which estimate.
+
+    Those that came out badly, and those whose focal length the estimate contradicts at the moment that it settled.
+    """
+    decision = _settled_estimate(state) if not is_given(config.inference) else None
+    hint = decision[1] if decision is not None else None
+    again: dict[_Composition, FocalHint | None] = {}
     for composition in _all_compositions(state, config):
-        quality = _quality(state, composition)
-        if composition.segment.index >= settled_at + HINT_LAG or quality is None or not quality.focal_over_width > 0.0:
+        geometry = _geometry(state, composition, 1)
+        if geometry is None or (decision is None and not is_given(config.inference)):
             continue
-        if abs(quality.focal_over_width / hint.focal_over_width - 1.0) > MAX_FOCAL_DEVIATION:
-            contradicted[composition] = hint
-    return contradicted
+        if geometry.verdict in _BAD and _wider(state, composition) is not composition:
+            again[composition] = hint
+        elif decision is not None and hint is not None and composition.segment.index < decision[0] + HINT_LAG:
+            found = geometry.quality.focal_over_width
+            if found > 0.0 and abs(found / hint.focal_over_width - 1.0) > MAX_FOCAL_DEVIATION:
+                again[composition] = hint
+    if hint is None:
+        return again
+    firm = replace(hint, relative_sigma=min(hint.relative_sigma, CONSENSUS_RELATIVE_SIGMA))
+    return dict.fromkeys(again, firm)
+
+
+def _wider(state: LogState, composition: _Composition) -> _Composition:
+    """The same base with more of the keyframes before it; the composition itself where there are none."""
+    before = state.segments.get(composition.segment.index - 1)
+    if before is None or composition.part is SubmapPart.SECOND_HALF:
+        return composition
+    count = _WIDER_OVERLAP_FACTOR * len(composition.overlap_keyframe_ids)
+    wider = before.base_keyframe_ids[-count:] if count else ()
+    if len(wider) <= len(composition.overlap_keyframe_ids):
+        return composition
+    return replace(composition, overlap_keyframe_ids=wider)
 
 
 def _settled_estimate(state: LogState) -> tuple[int, FocalHint] | None:
@@ -199,7 +219,7 @@ def _settled_estimate(state: LogState) -> tuple[int, FocalHint] | None:
 
 
 def _predict_job(
-    state: LogState, composition: _Composition, revision: int, hint: FocalHint | None
+    state: LogState, config: Config, composition: _Composition, revision: int, hint: FocalHint | None
 ) -> Iterator[PlannedJob]:
     members = composition.overlap_keyframe_ids + composition.base_keyframe_ids
     if any(keyframe_id not in state.keyframes for keyframe_id in members):
@@ -217,7 +237,7 @@ def _predict_job(
         overlap_keyframe_ids=composition.overlap_keyframe_ids,
         base_keyframe_ids=composition.base_keyframe_ids,
         zero_motion_copies=copies,
-        focal_hint=hint,
+        focal_hint=given_hint(config.inference, keyframes[0].width_px, keyframes[0].height_px) or hint,
         ego_mask=composition.segment.ego_mask,
         part=part,
     )

@@ -16,8 +16,8 @@ from vggt_motion.records import (
     segment_index_of,
 )
 
-MAX_REVISION = 2  # a submap is predicted at most once more, with a settled focal length
-_USABLE = frozenset({SubmapVerdict.GOOD, SubmapVerdict.LOW_QUALITY, SubmapVerdict.ROTATION_ONLY})
+MAX_REVISION = 2  # a submap is predicted at most once more: with a settled focal length, in a wider view, or both
+_USABLE = (SubmapVerdict.GOOD, SubmapVerdict.LOW_QUALITY, SubmapVerdict.ROTATION_ONLY)  # best first
 
 
 @dataclass
@@ -76,12 +76,10 @@ class LogState:
         return next(iter(self.graphs.values()), None)
 
     def submap(self, index: int) -> SubmapGeometry | None:
-        """The submap's usable geometry of the highest revision; a failed revision never hides an earlier good one."""
-        for revision in range(MAX_REVISION, 0, -1):
-            geometry = self.submaps.get((index, revision))
-            if geometry is not None and geometry.verdict in _USABLE and geometry.frames:
-                return geometry
-        return None
+        """The submap's usable geometry of the best verdict, of the higher revision where two are alike."""
+        tried = (self.submaps.get((index, revision)) for revision in range(MAX_REVISION, 0, -1))
+        usable = [geometry for geometry in tried if geometry is not None and geometry.verdict in _USABLE]
+        return min((g for g in usable if g.frames), key=lambda g: _USABLE.index(g.verdict), default=None)
 
     def usable_submaps(self) -> dict[int, SubmapGeometry]:
         """:meth:`submap` of every index that has one, in index order."""

@@ -28,6 +28,7 @@ from vggt_motion.records import (
     Segment,
     SubmapGeometry,
     SubmapPose,
+    SubmapVerdict,
     submap_index,
 )
 
@@ -59,6 +60,7 @@ class TrajectoryPose:
     origin: PoseOrigin
     component: int  # first submap of its connected part, across which poses share no frame; NO_COMPONENT = no pose
     world_from_camera: Array | None  # (4, 4), world units; None if and only if the origin is NONE
+    verdict: SubmapVerdict | None = None  # of the submap that it comes from, the worse of two; None = no pose, or none
 
 
 @dataclass(frozen=True)
@@ -143,11 +145,12 @@ class _Solved:
     world_from_camera: Array
     component: int
     origin: PoseOrigin
+    verdict: SubmapVerdict | None = None
 
 
 def _solve_keyframes(submaps: Mapping[int, SubmapGeometry], graph: GraphUpdate) -> dict[str, _Solved]:
     """Poses of the keyframes that a solved submap holds: home before overlap before loop frames, then index order."""
-    candidates: dict[str, tuple[tuple[int, int], FrameGeometry, SubmapPose]] = {}
+    candidates: dict[str, tuple[tuple[int, int], FrameGeometry, SubmapPose, SubmapVerdict]] = {}
     for pose in graph.poses:
         submap = submaps.get(pose.submap_index)
         if submap is None or submap.spec.revision != pose.submap_revision:
@@ -158,14 +161,15 @@ def _solve_keyframes(submaps: Mapping[int, SubmapGeometry], graph: GraphUpdate) 
             found = candidates.get(frame.keyframe_id)
             place = (rank[frame.keyframe_id], pose.submap_index)
             if found is None or place < found[0]:
-                candidates[frame.keyframe_id] = (place, frame, pose)
+                candidates[frame.keyframe_id] = (place, frame, pose, submap.verdict)
     return {
         keyframe_id: _Solved(
             pose.world_from_submap.act_pose(frame.submap_from_camera),
             pose.component,
             PoseOrigin.HOME if role == 0 else PoseOrigin.OTHER_SUBMAP,
+            verdict,
         )
-        for keyframe_id, ((role, _), frame, pose) in candidates.items()
+        for keyframe_id, ((role, _), frame, pose, verdict) in candidates.items()
     }
 
 
@@ -207,7 +211,8 @@ def _fill(
             if left.component == right.component:
                 fraction = _fraction(entries, before, position, after)
                 between = se3.interpolate(left.world_from_camera, right.world_from_camera, fraction)
-                found[position] = _Solved(between, left.component, PoseOrigin.INTERPOLATED)
+                worse = _worse(left.verdict, right.verdict)
+                found[position] = _Solved(between, left.component, PoseOrigin.INTERPOLATED, worse)
             else:
                 found[position] = replace(left, origin=PoseOrigin.HELD)
     for position, entry in enumerate(entries):
@@ -222,7 +227,13 @@ def _fill(
             PoseOrigin.NONE if solution is None else solution.origin,
             NO_COMPONENT if solution is None else solution.component,
             None if solution is None else solution.world_from_camera,
+            None if solution is None else solution.verdict,
         )
+
+
+def _worse(one: SubmapVerdict | None, other: SubmapVerdict | None) -> SubmapVerdict | None:
+    known = [verdict for verdict in (one, other) if verdict is not None]
+    return max(known, key=list(SubmapVerdict).index, default=None)
 
 
 def _fraction(entries: Sequence[FrameEntry], before: int, position: int, after: int) -> float:

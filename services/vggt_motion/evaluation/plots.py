@@ -105,6 +105,10 @@ def trajectory_figure(frames: ComponentTrack, keyframes: ComponentTrack, length_
             axes.plot(
                 plan.horizontal(at), plan.vertical(at), ".", color=color, ms=7, mec="white", mew=0.5, label="keyframes"
             )
+        doubtful = frames.doubtful_part(component)
+        if doubtful is not None and len(finite(doubtful)):
+            at = _thinned(finite(doubtful)).positions
+            axes.plot(plan.horizontal(at), plan.vertical(at), "o", mfc="none", mec="#c62828", ms=9, label="doubtful")
         mark_ends(axes, plan, positions, is_labelled=True)
         heights.append(panel_inches(_frame_axes(axes, plan, positions, 0.12, shape), width))
         plan.label(axes, length_unit)

@@ -23,6 +23,7 @@ class ComponentTrack:
 
     track: PoseTrack
     components: npt.NDArray[np.int64]  # (N,): index of the first submap of the part
+    doubtful: npt.NDArray[np.bool_] | None = None  # (N,): the pose comes from a submap that is not good; None = none is
 
     def __post_init__(self) -> None:
         if self.components.shape != (len(self.track),):
@@ -30,6 +31,13 @@ class ComponentTrack:
 
     def __len__(self) -> int:
         return len(self.track)
+
+    def doubtful_part(self, component: int) -> PoseTrack | None:
+        """The poses of a part that come from doubtful submaps; None if there are none."""
+        if self.doubtful is None:
+            return None
+        chosen = np.flatnonzero(self.doubtful & (self.components == component))
+        return self.track.subset(chosen) if len(chosen) else None
 
     def parts(self) -> tuple[tuple[int, PoseTrack], ...]:
         """(component id, its poses in time order), in order of the id."""

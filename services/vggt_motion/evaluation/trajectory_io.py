@@ -21,13 +21,13 @@ from vggt_motion.backend.trajectory import PoseOrigin, Trajectory, TrajectoryPos
 from vggt_motion.errors import InputError
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.track import PoseTrack
-from vggt_motion.records import MotionState
+from vggt_motion.records import MotionState, SubmapVerdict
 
 _NS = 1_000_000_000
 _JSON_SCHEMA = "vggt_motion.trajectory/1"
 _CSV_COLUMNS = (
     *("camera", "epoch", "frame_index", "capture_time_ns", "state", "is_keyframe", "origin", "component"),
-    *("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
+    *("tx", "ty", "tz", "qx", "qy", "qz", "qw", "submap_verdict"),
 )
 _ORTHONORMAL_TOLERANCE = 1e-2  # KITTI files are often written with six digits
 
@@ -58,6 +58,7 @@ def to_csv(trajectory: Trajectory) -> str:
                 *(frame.camera, frame.epoch, frame.frame_index, frame.capture_time_ns, frame.state.value),
                 *(int(frame.is_keyframe), frame.origin.value, frame.component),
                 *cells,
+                frame.verdict.value if frame.verdict is not None else "",
             ]
         )
     return out.getvalue()
@@ -81,6 +82,7 @@ def to_json(trajectory: Trajectory) -> str:
                     "is_keyframe": frame.is_keyframe,
                     "origin": frame.origin.value,
                     "component": frame.component,
+                    "submap_verdict": frame.verdict.value if frame.verdict is not None else None,
                     "world_from_camera": None
                     if frame.world_from_camera is None
                     else frame.world_from_camera[:3].tolist(),
@@ -154,8 +156,8 @@ def read_csv(path: Path) -> tuple[TrajectoryPose, ...]:
         if len(row) != len(_CSV_COLUMNS):
             raise InputError(f"{path}:{number}: {len(row)} cells instead of {len(_CSV_COLUMNS)}")
         pose = None
-        if any(row[8:]):
-            tx, ty, tz, x, y, z, w = _numbers(path, number, row[8:], 7)
+        if any(row[8:15]):
+            tx, ty, tz, x, y, z, w = _numbers(path, number, row[8:15], 7)
             pose = se3.make(se3.rotation_from_quaternion(np.array([w, x, y, z])), np.array([tx, ty, tz]))
         try:
             camera, epoch, index, time_ns, state, is_key, origin, component = row[:8]
@@ -163,6 +165,7 @@ def read_csv(path: Path) -> tuple[TrajectoryPose, ...]:
                 TrajectoryPose(
                     *(camera, int(epoch), int(index), int(time_ns), MotionState(state), bool(int(is_key))),
                     *(PoseOrigin(origin), int(component), pose),
+                    SubmapVerdict(row[15]) if row[15] else None,
                 )
             )
         except ValueError as error:
@@ -197,6 +200,7 @@ def _frame_of(entry: dict[str, Any]) -> TrajectoryPose:
         *(str(entry["camera"]), int(entry["epoch"]), int(entry["frame_index"]), int(entry["capture_time_ns"])),
         *(MotionState(entry["state"]), bool(entry["is_keyframe"]), PoseOrigin(entry["origin"])),
         *(int(entry["component"]), pose),
+        SubmapVerdict(entry["submap_verdict"]) if entry["submap_verdict"] is not None else None,
     )
 
 
