@@ -2,6 +2,9 @@
 
     python tests/benchmarks/bench_accuracy.py [SEQUENCE ...] [--set section.field=value] [--verbose]
 
+A sequence is a path, a name below the evaluation data, or a name of ``derived_sequences.py``: other lenses, small
+images, stops, turns on the spot. Without any, all of them.
+
 Prints, per sequence: frames, keyframes, submaps and how the predictor judged them, refused constraints, breaks, ATE of
 all frames after Sim(3) alignment, drift, and seconds of video against seconds of computing on one core.
 """
@@ -11,9 +14,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 import cv2
+import derived_sequences
 
 from vggt_motion.config import Config, load_config
 from vggt_motion.evaluation import metrics
@@ -33,7 +38,7 @@ SEQUENCES = (
     "video/standing_at_red_light.mp4",
 )
 HEADER = ("sequence", "frames", "key", "submaps", "refused", "breaks", "ATE m", "max m", "drift %", "video s", "CPU s")
-WIDTHS = (34, 7, 5, 22, 8, 7, 8, 8, 8, 8, 8)
+WIDTHS = (34, 7, 5, 30, 8, 7, 8, 8, 8, 8, 8)
 
 
 def row(cells: tuple[str, ...]) -> str:
@@ -108,18 +113,26 @@ def main() -> int:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     config: Config = load_config(assignments=arguments.assignments)
-    chosen = arguments.sequences or [str(REPOSITORY / "tests/data/kitti_06_first51"), *SEQUENCES]
+    sample = REPOSITORY / "tests/data/kitti_06_first51"
+    chosen = arguments.sequences or [str(sample), *SEQUENCES, *derived_sequences.NAMES]
     print(row(HEADER))
-    for name in chosen:
-        location = Path(name) if Path(name).exists() else DATA / name
-        if not location.exists():
-            print(f"{name}: not there, left out (set VGGT_MOTION_DATA)")
-            continue
-        run = run_offline(str(location), config)
-        label = location.name if location.is_relative_to(DATA) else f"shipped {location.name}"
-        print(report(label, location, run), flush=True)
-        if arguments.verbose:
-            details(run)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in chosen:
+            location = Path(name) if Path(name).exists() else DATA / name
+            label = f"shipped {location.name}" if location == sample else location.name
+            if name in derived_sequences.NAMES:
+                label = name
+                try:
+                    location = derived_sequences.write(name, DATA, Path(folder))
+                except OSError:
+                    location = Path(folder) / "absent"
+            if not location.exists():
+                print(f"{name}: not there, left out (set VGGT_MOTION_DATA)")
+                continue
+            run = run_offline(str(location), config)
+            print(report(label, location, run), flush=True)
+            if arguments.verbose:
+                details(run)
     return 0
 
 

@@ -121,6 +121,7 @@ def compare_with_colmap(name: str, run: OfflineRun, truth: Array, config: Config
         if frame.frame_index in images
     }
     print(f"\n{name}: {len(images)} keyframes            registered  seconds     ATE m (keyframes)")
+    lines = []
     for label, spent, found in (
         ("this predictor and the pose graph", sum(run.seconds.values()), ours),
         ("SIFT + pycolmap incremental mapping", seconds, centres),
@@ -129,7 +130,13 @@ def compare_with_colmap(name: str, run: OfflineRun, truth: Array, config: Config
         error = math.nan
         if len(shared) >= 3:
             error = align(np.stack([found[k] for k in shared]), np.stack([truth[k][:3, 3] for k in shared])).rmse
+        lines.append((float(len(shared)), spent, error))
         print(f"  {label:<38} {len(shared):>6} {spent:>10.1f} {error:>12.3f}")
+    (registered, spent, error), (their_registered, their_spent, their_error) = lines
+    print(
+        f"  {'ratio, theirs over ours':<38} {their_registered / max(registered, 1.0):>6.2f} "
+        f"{their_spent / spent:>10.1f} {their_error / error:>12.2f}"
+    )
 
 
 def decoded(encoded: bytes) -> npt.NDArray[np.uint8]:
