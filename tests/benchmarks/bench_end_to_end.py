@@ -29,7 +29,9 @@ def run(location: Path, workers: int, assignments: list[str], out: Path) -> dict
     command += [part for value in values for part in ("--set", value)]
     if (location / "poses.txt").is_file():
         command += ["--ground-truth", str(location / "poses.txt")]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode != 0:
+        sys.exit(done.stderr)
     metrics: dict[str, object] = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     return metrics
 

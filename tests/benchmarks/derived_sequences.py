@@ -24,8 +24,9 @@ Image = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.float64]
 Frames = Iterator[tuple[Image, Array]]
 
-_KITTI = {  # focal length and principal point of the rectified images, by the calibration of the benchmark
+KITTI_CAMERAS = {  # focal length and principal point of the rectified images, by the calibration of the benchmark
     "kitti_00_first200": (718.856, 607.1928, 185.2157),
+    "kitti_01_first51": (718.856, 607.1928, 185.2157),
     "kitti_06_first51": (707.0912, 601.8873, 183.1104),
 }
 
@@ -38,7 +39,7 @@ def _recorded(data: Path, name: str) -> Frames:
 
 def _distorted(data: Path, name: str, k1: float = -0.3) -> Frames:
     """As an unrectified camera sees it: barrel distortion about the same centre, cropped to what is known."""
-    focal, cx, cy = _KITTI[name]
+    focal, cx, cy = KITTI_CAMERAS[name]
     maps: tuple[Array, Array] | None = None
     for image, pose in _recorded(data, name):
         height, width = image.shape
