@@ -4,7 +4,8 @@
 
 Baseline and frontend take turns on the same frames, and processor time is counted, so that whatever else the machine
 does hits both alike. The baseline is
-the same decode call, the same resize and the same DIS on the same images, nothing else. Both decode grey.
+the same decode call, the same resize and the same DIS on the same images, nothing else. Both decode grey. The cost of
+the service around it is measured on its own process.
 
 Then what it is worth: F1 of turning against the ground-truth yaw rate with one configuration for all sequences, for
 both scores, and how many keyframes and submaps each strategy makes.
@@ -17,6 +18,7 @@ import os
 import resource
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +30,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # helpers of the tests
 
+from live_session import live_session
 from motion_truth import f1, is_turning
 from vggt_motion.bus import codec
 from vggt_motion.bus.images import encode_image
@@ -42,6 +45,7 @@ from vggt_motion.sources.source import Frame
 
 TARGET_RATIO = 1.5
 BLOCK = 10  # frames per turn
+SHORT_RUN, SERVICE_RUNS = 20, 3
 
 
 def evaluation_data() -> Path:
@@ -124,6 +128,37 @@ def parts(frames: list[Frame]) -> None:
     outputs = [output for frame in frames for output in pipeline.push(frame)] + pipeline.finish()
     keyframes = [output.keyframe for output in outputs if isinstance(output, KeyframeOutput)]
     timed("service: keyframe record, per keyframe", codec.encode, keyframes)
+
+
+def service_cost(sequence: Path) -> None:
+    """Processor time per frame of the whole process ``serve frontend``: pipeline, publishing, records, all threads.
+
+    The difference between a long and a short run, so that the start (imports, joining the bus) does not count.
+    """
+    pure_ms, whole_ms = [], []
+    frames = list(open_source(str(sequence)).frames())
+    for _ in range(SERVICE_RUNS):
+        used = [_service_s(sequence, end) for end in (SHORT_RUN, len(frames))]
+        whole_ms.append(1e3 * (used[1] - used[0]) / (len(frames) - SHORT_RUN))
+        pipeline = FrontendPipeline(FrontendConfig(), "front")
+        begin = time.thread_time()
+        for frame in frames:
+            pipeline.push(frame)
+        pure_ms.append(1e3 * (time.thread_time() - begin) / len(frames))
+    pure, whole = statistics.median(pure_ms), statistics.median(whole_ms)
+    sys.stdout.write(
+        f"service process, {sequence.name}: {whole:.2f} ms of processor time a frame, "
+        f"of which the pure stages {pure:.2f} ms, the rest (bus, records, files, health) {whole - pure:.2f} ms\n"
+    )
+
+
+def _service_s(sequence: Path, end: int) -> float:
+    with tempfile.TemporaryDirectory() as folder, live_session(Path(folder)) as session:
+        process = session.start("frontend", "--source", str(sequence), "--end", str(end)).process
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0
+        return usage.ru_utime + usage.ru_stime
 
 
 def memory(frames: list[Frame], count: int) -> None:
@@ -222,6 +257,7 @@ def main() -> None:
     sys.stdout.write(f"OpenCV {cv2.__version__}, one thread, medians of blocks of {BLOCK} frames\n")
     compare("KITTI 00, 1241x376, driving", kitti, arguments.frames)
     parts(kitti[:60])
+    service_cost(data / "kitti_00_first200")
     highway = list(open_source(str(data / "video" / "highway_straight.mp4"), end=60).frames())
     compare("motorway, 1920x1080, driving", resized(highway, 1920, 1080), arguments.frames // 2)
     parts(resized(highway[:20], 1920, 1080))
