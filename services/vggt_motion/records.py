@@ -314,7 +314,7 @@ class EdgeReport:
     """How one constraint fared in the solve."""
 
     constraint_id: str
-    weighted_residual: float  # sqrt(r^T Omega r) at the solution
+    weighted_residual: float  # sqrt(r^T Omega r) at the solution; NaN where the ends are in different components
     is_used: bool  # False where a loop was switched off
     robust_weight: float = 1.0  # in [0, 1]
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from vggt_motion import __version__
 from vggt_motion.backend import focal, posegraph
-from vggt_motion.backend.planner import current_constraints
+from vggt_motion.backend.planner import current_constraints, undecided_joints
 from vggt_motion.backend.session_map import build_session_map, main_component
 from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
@@ -39,7 +39,7 @@ from vggt_motion.evaluation.summary import error_table, is_kitti
 from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_csv, to_kitti, to_tum
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.geometry.track import PoseTrack
-from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, ScaleKind, SubmapVerdict
+from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, SubmapVerdict
 
 METRICS_FILE = "metrics.json"
 _MIN_ALIGNED_POSES = 3
@@ -106,8 +106,7 @@ def write_results(
     trajectory = compose(
         list(state.keyframes.values()), segments, submaps, graph, known_distance_m=config.backend.known_distance_m
     )
-    is_metric = bool(submaps) and all(g.scale_kind is ScaleKind.METRIC for g in submaps.values())
-    has_metres = is_metric or config.backend.known_distance_m is not None
+    has_metres = state.is_metric or config.backend.known_distance_m is not None
     component = main_component(trajectory)
     cloud = None
     if component != NO_COMPONENT and graph.poses:
@@ -157,12 +156,21 @@ def write_results(
 def _catch_up(state: LogState, config: Config) -> None:
     """Solve what came after the newest graph, where a run was ended before the backend did."""
     graph = state.latest_graph()
-    inputs = len(state.submaps) + len(state.constraints)
+    inputs = state.graph_input_count
     nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
     if not nodes or (graph is not None and (graph.is_final or graph.revision >= inputs)):
         return
-    constraints = current_constraints(state)
-    state.apply(posegraph.solve(nodes, constraints, config.backend, revision=inputs, is_final=False))
+    state.apply(
+        posegraph.solve(
+            nodes,
+            current_constraints(state),
+            config.backend,
+            revision=inputs,
+            is_final=False,
+            is_metric=state.is_metric,
+            undecided=undecided_joints(state, config),
+        )
+    )
 
 
 def _write(path: Path, text: str) -> None:

@@ -395,3 +395,56 @@ def test_the_outcome_does_not_depend_on_who_is_faster(
         specs = {key: value.spec for key, value in state.submaps.items()}
         outcomes.append((specs, sorted(state.constraints), sorted(state.dead_jobs)))
     assert outcomes[0] == outcomes[1]
+
+
+def live_breaks(state: LogState) -> tuple[str, ...]:
+    nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
+    joints = planner.undecided_joints(state, CONFIG)
+    return posegraph.find_breaks(nodes, planner.current_constraints(state), joints)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32), count=st.integers(2, 8), dead_share=st.sampled_from([0.0, 0.3, 0.6]))
+def test_a_break_is_named_only_once_nothing_can_mend_it(seed: int, count: int, dead_share: float) -> None:
+    """At every moment of a run, jobs in any order: what is called a break then is one at the end too."""
+    state, order = started(count), random.Random(seed)
+    named: set[str] = set()
+    while jobs := planner.next_jobs(state, CONFIG):
+        job = order.choice(jobs)
+        is_doomed = zlib.crc32(f"{seed}/{job.job_id}".encode()) % 100 < 100 * dead_share
+        state.apply(dead(job.job_id) if is_doomed else result(job, {}, 0.02))
+        named.update(live_breaks(state))
+    assert planner.undecided_joints(state, CONFIG) == frozenset()
+    nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
+    final = posegraph.find_breaks(nodes, planner.current_constraints(state))
+    assert named <= set(final)
+    assert live_breaks(state) == final
+
+
+def test_a_registration_that_is_still_leased_is_no_break_and_a_dead_one_is() -> None:
+    state = started(3)
+    while predictions := [job for job in planner.next_jobs(state, CONFIG) if job.kind is JobKind.PREDICT]:
+        for job in predictions:
+            state.apply(result(job, {}, 0.02))
+    leased = planner.next_jobs(state, CONFIG)
+    assert [job.kind for job in leased] == [JobKind.REGISTER] * 2
+    assert live_breaks(state) == () and planner.undecided_joints(state, CONFIG) == {2, 4}
+    state.apply(dead(leased[1].job_id))
+    assert len(live_breaks(state)) == 1 and "before submap 4" in live_breaks(state)[0]
+    task = leased[0].task
+    assert isinstance(task, RegisterTask)
+    state.apply(replace(constraint(task), accepted=False, reason="no texture"))
+    assert len(live_breaks(state)) == 2 and "no texture" in live_breaks(state)[0]
+
+
+def test_a_session_is_metric_when_all_its_submaps_are() -> None:
+    state = started(2)
+    assert not state.is_metric
+    for job in planner.next_jobs(state, CONFIG):
+        assert isinstance(job.task, PredictTask)
+        state.apply(replace(geometry(job.task.spec), scale_kind=ScaleKind.METRIC))
+    assert state.is_metric
+    register = planner.next_jobs(state, CONFIG)[0].task
+    assert isinstance(register, RegisterTask) and register.fix_scale
+    state.submaps[(2, 1)] = replace(state.submaps[(2, 1)], scale_kind=ScaleKind.RELATIVE)
+    assert not state.is_metric

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import graphs
 from vggt_motion.backend import factors, posegraph, skeleton
 from vggt_motion.backend.incremental import LiveGraph
+from vggt_motion.bus import codec
 from vggt_motion.config import BackendConfig
 from vggt_motion.errors import OptimizationError
 from vggt_motion.geometry import sim3
@@ -173,8 +174,17 @@ def test_a_break_starts_a_component_and_says_why() -> None:
     for root in (0, 10, 20):
         np.testing.assert_array_equal(update.poses[root].world_from_submap.matrix(), np.eye(4))
     # a single loop cannot be told from a false one, so that it joins no parts
-    unused = next(edge for edge in update.edges if edge.constraint_id == across.record_id)
-    assert not unused.is_used
+    live = LiveGraph(CONFIG)
+    live.add(drive.nodes, [*constraints, across])
+    for graph in (update, live.snapshot(1)):
+        unused = next(edge for edge in graph.edges if edge.constraint_id == across.record_id)
+        assert not unused.is_used and np.isnan(unused.weighted_residual)
+        back = codec.decode(GraphUpdate, codec.encode(graph))
+        assert next(edge for edge in back.edges if np.isnan(edge.weighted_residual)).constraint_id == across.record_id
+        assert len(back.edges) == len(graph.edges) == 28
+    undecided = posegraph.solve(drive.nodes, constraints, CONFIG, revision=1, is_final=False, undecided={20})
+    assert undecided.breaks == update.breaks[:1]
+    assert [pose.component for pose in undecided.poses] == [pose.component for pose in update.poses]
 
 
 def test_constraints_of_other_revisions_take_no_part() -> None:

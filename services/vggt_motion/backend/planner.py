@@ -289,6 +289,37 @@ def _register_job(
     yield PlannedJob(job_id, JobKind.REGISTER, RegisterTask(spec, shared, fix_scale), priority=spec.j)
 
 
+def undecided_joints(state: LogState, config: Config) -> frozenset[int]:
+    """Submaps of which nobody can say yet whether the trajectory goes on to them or breaks there.
+
+    That is open while the submap or one before it is still to be predicted, or while the registration of the
+    two is in the queue or leased.
+    """
+    second = _second_predictions(state, config)
+    undecided: set[int] = set()
+    is_open = False  # what lies between the last submap with geometry and the next one
+    before: _Composition | None = None
+    for composition in _all_compositions(state, config):
+        if before is not None and any(
+            index not in state.segments for index in range(before.segment.index + 1, composition.segment.index)
+        ):
+            is_open = True
+        is_pending = not _is_resolved(state, composition, 1) or (
+            composition in second and not _is_resolved(state, composition, 2)
+        )
+        geometry = _newest_usable(state, composition)
+        if geometry is None:
+            is_open |= is_pending
+        else:
+            is_next = before is not None and composition.segment.index <= before.segment.index + 1
+            earlier = _newest_usable(state, before) if before is not None and is_next else None
+            if is_open or is_pending or any(_register_job(state, earlier, geometry)):
+                undecided.add(composition.index)
+            is_open = is_pending
+        before = composition
+    return frozenset(undecided)
+
+
 def current_constraints(state: LogState) -> list[Constraint]:
     """Constraints between the submaps that the trajectory uses, sorted by identity."""
     current = {index: geometry.spec.revision for index, geometry in state.usable_submaps().items()}

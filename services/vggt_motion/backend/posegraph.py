@@ -6,7 +6,7 @@ The direction of constraints and residuals is explained in :mod:`vggt_motion.bac
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from vggt_motion.backend.factors import Edge, Loss
@@ -32,6 +32,7 @@ def solve(
     revision: int,
     is_final: bool,
     is_metric: bool = False,
+    undecided: Collection[int] = (),
 ) -> GraphUpdate:
     """Solve the pose graph afresh: a pure function of its arguments, whatever their order.
 
@@ -45,6 +46,8 @@ def solve(
         revision: number of the update.
         is_final: whether this is the last solve of the run.
         is_metric: all submaps are in metres: SE(3) factors, all scales 1.
+        undecided: submaps whose joint with those before is still being worked on (``planner.undecided_joints``):
+            components of their own for now, but no break.
 
     Raises:
         OptimizationError: the solver failed or diverged.
@@ -81,15 +84,17 @@ def solve(
         is_final=is_final,
         poses=tuple(SubmapPose(index, latest[index], parts.root[index], poses[index]) for index in sorted(latest)),
         edges=tuple(sorted(edges, key=lambda edge: edge.constraint_id)),
-        breaks=_breaks(latest, parts, constraints),
+        breaks=_breaks(latest, parts, constraints, undecided),
         final_cost=cost,
     )
 
 
-def find_breaks(nodes: Sequence[tuple[int, int]], constraints: Sequence[Constraint]) -> tuple[str, ...]:
-    """One line for each place where the trajectory is broken, and why."""
+def find_breaks(
+    nodes: Sequence[tuple[int, int]], constraints: Sequence[Constraint], undecided: Collection[int] = ()
+) -> tuple[str, ...]:
+    """One line for each place where the trajectory is broken, and why; ``undecided`` as in :func:`solve`."""
     latest = _latest(nodes)
-    return _breaks(latest, _components(latest, _usable(latest, constraints)), constraints)
+    return _breaks(latest, _components(latest, _usable(latest, constraints)), constraints, undecided)
 
 
 def to_edge(constraint: Constraint, config: BackendConfig) -> Edge:
@@ -167,7 +172,9 @@ def _components(latest: Mapping[int, int], usable: Sequence[Constraint]) -> _Par
     return _Parts(root, start)
 
 
-def _breaks(latest: Mapping[int, int], parts: _Parts, constraints: Sequence[Constraint]) -> tuple[str, ...]:
+def _breaks(
+    latest: Mapping[int, int], parts: _Parts, constraints: Sequence[Constraint], undecided: Collection[int]
+) -> tuple[str, ...]:
     refused: dict[int, list[str]] = defaultdict(list)
     for constraint in sorted(constraints, key=order):
         if (
@@ -179,6 +186,8 @@ def _breaks(latest: Mapping[int, int], parts: _Parts, constraints: Sequence[Cons
     lines = []
     roots = sorted(index for index, root in parts.root.items() if index == root)
     for index in roots[1:]:
+        if index in undecided:
+            continue
         reason = "; ".join(refused[index]) or "no constraint to the submap before it"
         lines.append(f"the trajectory is broken before submap {index}: {reason}")
     return tuple(lines)

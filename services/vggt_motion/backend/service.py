@@ -1,6 +1,8 @@
 """The backend: follows the log, submits the jobs that it calls for, and solves the pose graph (DESIGN 3.6 and 4).
 
-All its state is a fold of the log: killed and started again, it plans the same jobs and solves the same graph.
+While the run lasts, every new submap or constraint goes into the live graph, and what that then says is published: a
+live update holds all that the log held when it was begun. The final graph is a fresh batch over everything. All state
+is a fold of the log: killed and started again, the backend plans the same jobs and solves the same final graph.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 
-from vggt_motion.backend import planner, posegraph
+from vggt_motion.backend import live, planner, posegraph
 from vggt_motion.backend.state import LogState
 from vggt_motion.bus import codec
 from vggt_motion.bus.log import LogFollower
@@ -36,6 +38,7 @@ class _Backend:
         self._state = LogState()
         self._log = LogFollower(context.bus)
         self._child = ComputeChild("backend")
+        self._live = live.LiveFeed()
         self._submitted: set[str] = set()
         self._has_unsubmitted = False
         self._retry_at = 0.0
@@ -44,6 +47,7 @@ class _Backend:
 
     def serve(self) -> None:
         try:
+            self._child.start()  # its imports take longer than the first submap should wait for
             while not self._context.stopping.is_set():
                 if not self._pump() and not self._solve():
                     self._context.stopping.wait(_IDLE_S)
@@ -108,23 +112,12 @@ class _Backend:
         if graph is not None and graph.is_final:
             return False
         is_final = planner.is_complete(state, self._config)
-        inputs = len(state.submaps) + len(state.constraints)
+        inputs = state.graph_input_count
         if not is_final and (inputs == 0 or inputs <= max(self._solved_inputs, graph.revision if graph else -1)):
             return False
-        nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
-        constraints = planner.current_constraints(state)
         try:
             # The revision counts what went in, so that a backend that was killed and started again makes it again.
-            update = self._child.call(
-                _solve_graph,
-                nodes,
-                constraints,
-                self._config,
-                inputs,
-                is_final,
-                deadline_s=self._config.backend.solve_deadline_s,
-                on_tick=self._keep_up,
-            )
+            update = self._solve_final(inputs) if is_final else self._update_live(inputs)
         except ComputeCancelledError:
             raise
         except VggtMotionError as error:
@@ -144,6 +137,38 @@ class _Backend:
             # A backend before this one had seen as many records, but not the same ones: its graph stands for now.
             _log.info("live graph not kept", extra={"reason": str(error)})
         return True
+
+    def _solve_final(self, revision: int) -> GraphUpdate:
+        state = self._state
+        nodes = [(index, geometry.spec.revision) for index, geometry in state.usable_submaps().items()]
+        return self._child.call(
+            _solve_graph,
+            nodes,
+            planner.current_constraints(state),
+            self._config,
+            revision,
+            state.is_metric,
+            deadline_s=self._config.backend.solve_deadline_s,
+            on_tick=self._keep_up,
+        )
+
+    def _update_live(self, revision: int) -> GraphUpdate:
+        undecided = planner.undecided_joints(self._state, self._config)
+        while True:
+            # What is new is sent, until the child's graph turns out to be another one than ours: then everything.
+            update = self._child.call(
+                live.advance,
+                self._live.next_step(self._state),
+                self._config.backend,
+                revision,
+                undecided,
+                deadline_s=self._config.backend.solve_deadline_s,
+                on_tick=self._keep_up,
+            )
+            if update is not None:
+                self._live.confirm()
+                return update
+            self._live.restart()
 
     def _append(self, update: GraphUpdate) -> None:
         while True:
@@ -169,6 +194,6 @@ class _Backend:
 
 
 def _solve_graph(
-    nodes: list[tuple[int, int]], constraints: list[Constraint], config: Config, revision: int, is_final: bool
+    nodes: list[tuple[int, int]], constraints: list[Constraint], config: Config, revision: int, is_metric: bool
 ) -> GraphUpdate:
-    return posegraph.solve(nodes, constraints, config.backend, revision=revision, is_final=is_final)
+    return posegraph.solve(nodes, constraints, config.backend, revision=revision, is_final=True, is_metric=is_metric)

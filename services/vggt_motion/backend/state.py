@@ -10,6 +10,7 @@ from vggt_motion.records import (
     EventKind,
     GraphUpdate,
     Keyframe,
+    ScaleKind,
     Segment,
     SubmapGeometry,
     SubmapVerdict,
@@ -66,6 +67,17 @@ class LogState:
         """Whether the input is closed and every segment that it promised is here."""
         ended = self.stream_ended
         return ended is not None and len(self.segments) >= int(ended.detail.get("segment_count", "0"))
+
+    @property
+    def graph_input_count(self) -> int:
+        """How many records a graph of this moment is made from; only grows, and numbers the graphs."""
+        return len(self.submaps) + len(self.constraints) + len(self.dead_jobs)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether all usable submaps are in metres, so that every scale is 1."""
+        usable = self.usable_submaps().values()
+        return bool(usable) and all(geometry.scale_kind is ScaleKind.METRIC for geometry in usable)
 
     def unpredicted_segments(self) -> set[int]:
         """Indices of the closed segments that no submap came of yet."""

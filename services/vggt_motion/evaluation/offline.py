@@ -66,8 +66,14 @@ def run_offline(
     submaps = state.usable_submaps()
     nodes = [(index, geometry.spec.revision) for index, geometry in submaps.items()]
     constraints = planner.current_constraints(state)
-    revision = len(state.submaps) + len(state.constraints)
-    graph = posegraph.solve(nodes, constraints, config.backend, revision=revision, is_final=True)
+    graph = posegraph.solve(
+        nodes,
+        constraints,
+        config.backend,
+        revision=state.graph_input_count,
+        is_final=True,
+        is_metric=state.is_metric,
+    )
     state.apply(graph)
     trajectory = compose(
         list(state.keyframes.values()),

@@ -323,7 +323,7 @@ _EDGE_REPORT = plan(
     graph_pb2.EdgeReport,
     rules={
         "constraint_id": IDENTIFIER,
-        "weighted_residual": Real(0.0),
+        "weighted_residual": Real(0.0, allow_nan=True),
         "is_used": Flag(),
         "robust_weight": RATIO,
     },
