@@ -228,6 +228,43 @@ def inspect(
 
 
 @app.command()
+def export(
+    directory: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run, or of a ledger.")],
+    form: Annotated[str, typer.Option("--format", help="tum, kitti, csv, json, ply or colmap.")] = "colmap",
+    out: Annotated[Path | None, typer.Option(help="File to write; for colmap a folder.")] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    frames: Annotated[str, typer.Option(help="tum, kitti: all frames, or key frames only.")] = "all",
+    component: Annotated[
+        int | None, typer.Option(min=0, help="First submap of the connected part; default: all, or the largest.")
+    ] = None,
+    text: Annotated[bool, typer.Option("--text", help="colmap: text files instead of binary ones.")] = False,
+    undistort: Annotated[bool, typer.Option("--undistort", help="colmap: images and cameras as pinholes.")] = False,
+    max_points: Annotated[int, typer.Option(min=1000, help="colmap: most points.")] = 300_000,
+    max_observations: Annotated[int, typer.Option(min=1, help="colmap: most observations of an image.")] = 4096,
+) -> None:
+    """Write a run's trajectory, map or COLMAP model; the run may be finished, interrupted or still going on."""
+    from vggt_motion import export as exporter
+    from vggt_motion.launch import CONFIG_FILE, LEDGER_FOLDER
+
+    try:
+        wanted = exporter.ExportFormat(form)
+    except ValueError:
+        known = ", ".join(exporter.ExportFormat)
+        raise InputError(f"unknown format '{form}': known are {known}") from None
+    if frames not in ("all", "key"):
+        raise InputError(f"--frames is all or key, not '{frames}'")
+    ledger = directory / LEDGER_FOLDER if (directory / LEDGER_FOLDER).is_dir() else directory
+    stored = directory / CONFIG_FILE
+    settings = load_config(config or (stored if stored.is_file() else None), list(assignments or ()))
+    name = "colmap" if wanted is exporter.ExportFormat.COLMAP else f"export.{wanted}"
+    options = exporter.ExportOptions(
+        "key" if frames == "key" else "all", component, text, undistort, max_points, max_observations
+    )
+    sys.stdout.write(exporter.export(ledger, wanted, out or directory / name, settings, options) + "\n")
+
+
+@app.command()
 def record(
     directory: Annotated[Path, typer.Argument(help="Folder that gets run.mcap.")],
     config: ConfigOption = None,

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import psutil
+import pycolmap
 import pytest
 from plyfile import PlyData
 
@@ -123,6 +124,29 @@ def test_the_processes_compute_what_the_pure_method_does(finished: tuple[Path, A
     estimate = read_tum(out / "trajectory_frames.tum")
     np.testing.assert_array_equal(estimate.times_ns, offline.times_ns)
     np.testing.assert_allclose(estimate.positions, offline.positions, atol=1e-8)
+
+
+def test_a_finished_run_is_exported(finished: tuple[Path, Any], tmp_path: Path) -> None:
+    out, _ = finished
+    for form, name in (("tum", "trajectory_frames.tum"), ("kitti", "trajectory_frames.kitti"), ("ply", "map.ply")):
+        done = vggt_motion("export", str(out), "--format", form, "--out", str(tmp_path / name))
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
+    done = vggt_motion("export", str(out), "--out", str(tmp_path / "colmap"), "--undistort")
+    assert done.returncode == 0, done.stderr
+    keyframes = len(read_tum(out / "trajectory_keyframes.tum"))
+    model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse" / "0"))
+    assert model.num_images() == keyframes and model.num_points3D() > 5_000
+    assert model.compute_mean_track_length() > 2.0
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 1e-3
+    for image in model.images.values():
+        shape = cv2.imread(str(tmp_path / "colmap" / "images" / image.name)).shape
+        camera = model.cameras[image.camera_id]
+        assert (camera.width, camera.height) == (shape[1], shape[0]) and camera.model.name == "PINHOLE"
+    assert_one_clear_line(vggt_motion("export", str(tmp_path / "nothing")), 1, "no ledger")
+    assert_one_clear_line(vggt_motion("export", str(out), "--format", "las"), 2, "las")
+    assert_one_clear_line(vggt_motion("export", str(out), "--component", "7"), 2, "its parts are 0")
 
 
 def test_three_workers_give_the_same_trajectory(finished: tuple[Path, Any], sample: Path, tmp_path: Path) -> None:

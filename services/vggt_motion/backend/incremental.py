@@ -1,9 +1,10 @@
 """The live pose graph: one constraint at a time, with iSAM2, while the drive goes on (DESIGN 3.6).
 
-Chosen by measurement over the warm-started batch (tests/benchmarks/bench_posegraph.py; 10,000 submaps, 500 loops, one
-core): a submap without a loop costs under 3 ms, a loop under 200 ms, and what a loop moves is linearised anew only
-then. iSAM2's QR costs ten times that; its Cholesky is fast and may meet a system it cannot factor, upon which the
-graph is built again from a batch solve. The live estimate is for looking at: the final one is always a fresh batch
+Chosen by measurement over the warm-started batch, which costs a second and more per constraint at 10,000 submaps where
+this costs milliseconds, and a tenth of a second for a loop (tests/benchmarks/bench_posegraph.py). What a loop moves is
+linearised anew only then. Small graphs are built again from a batch solve for every loop, which judges the loops
+better and costs no more there. iSAM2's QR costs ten times its Cholesky, which may meet a system that it cannot factor:
+then the graph is built again too. The live estimate is for looking at: the final one is always a fresh batch
 (posegraph.solve).
 """
 
@@ -36,6 +37,7 @@ from vggt_motion.records import Constraint, ConstraintKind, EdgeReport, GraphUpd
 _LOG = logging.getLogger(__name__)
 
 _RELINEARISE_THRESHOLD = 1.0
+_SMALL = 300  # submaps up to which a loop is worth a batch solve
 _BULK = 100  # constraints at once, after a restart say, are solved together
 _NEVER = 2**31 - 1  # relinearisation is asked for where there is a reason, not every so many updates
 
@@ -65,7 +67,7 @@ class LiveGraph:
         Raises:
             OptimizationError: not even the batch solve succeeds.
         """
-        is_stale = False
+        is_stale = has_loop = False
         for index, revision in nodes:
             known = self._revisions.get(index)
             if known is None or revision > known:
@@ -75,7 +77,9 @@ class LiveGraph:
             if constraint.record_id not in self._constraints:
                 self._constraints[constraint.record_id] = constraint
                 self._pending[constraint.record_id] = constraint
-        if is_stale or len(self._pending) > _BULK:
+                has_loop |= constraint.accepted and constraint.spec.kind is ConstraintKind.LOOP
+        is_small = len(self._revisions) <= _SMALL
+        if is_stale or (has_loop and is_small) or len(self._pending) > _BULK:
             self._rebuild()
             return
         try:
@@ -133,7 +137,7 @@ class LiveGraph:
         parameters.setFactorization("CHOLESKY")
         parameters.setRelinearizeThreshold(_RELINEARISE_THRESHOLD)
         parameters.relinearizeSkip = _NEVER
-        # Looked for from the top of the tree down to the first submaps that hardly moved: a third of the time of a loop.
+        # From the top of the tree down to the first submaps that hardly moved: a third of the time of a loop.
         parameters.enablePartialRelinearizationCheck = True
         return gtsam.ISAM2(parameters)
 

@@ -32,8 +32,9 @@ def build_session_map(
     trajectory: Trajectory,
     config: BackendConfig,
     read_blob: Callable[[BlobRef], bytes],
+    component: int | None = None,
 ) -> PointMap:
-    """Gather the map of the largest connected part.
+    """Gather the map of one connected part.
 
     Args:
         keyframes: by id; their images give the colours.
@@ -42,19 +43,20 @@ def build_session_map(
         trajectory: composed from the same graph; gives scale and spacing of the keyframes.
         config: confidence threshold, voxels, greatest number of points.
         read_blob: fetches a payload; its errors pass through.
+        component: which part; the largest by default.
 
     Raises:
         CodecError: an image or a depth payload cannot be decoded.
     """
-    component = main_component(trajectory)
+    component = main_component(trajectory) if component is None else component
     steps = np.linalg.norm(np.diff(trajectory.track("key", component).positions, axis=0), axis=1)
     moving = steps[steps > 0.0]
     step = float(np.median(moving)) if len(moving) else 0.0
-    frames = _map_frames(keyframes, submaps, graph, component, read_blob)
+    frames = map_frames(keyframes, submaps, graph, component, read_blob)
     return build_map(frames, config, step=step, scale=trajectory.scale)
 
 
-def _map_frames(
+def map_frames(
     keyframes: Mapping[str, Keyframe],
     submaps: Mapping[int, SubmapGeometry],
     graph: GraphUpdate,
