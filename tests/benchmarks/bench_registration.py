@@ -24,10 +24,12 @@ from vggt_motion.geometry import se3, sim3
 from vggt_motion.geometry.projection import unproject
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.records import ConstraintKind, RegistrationSpec
+from vggt_motion.registration import sim3 as estimation
 from vggt_motion.registration.anchors import AnchorView, SharedFrame, register
 from vggt_motion.registration.sim3 import Sim3Estimate, estimate_sim3
 
 OVERLAP = 30  # frames, the peers' overlap
+FIXED_PASSES = 6
 DEPTH_NOISE = 0.02
 OUTLIERS = 0.1
 BOUNDARY_BIAS = 0.06  # of the depth, at the outermost frame of a submap
@@ -117,16 +119,31 @@ def points_of(frames: list[SharedFrame]) -> tuple[np.ndarray, np.ndarray, np.nda
     return sides[0].astype(np.float32), sides[1].astype(np.float32), depth
 
 
+def fixed_passes(
+    estimator: Callable[..., tuple[Callable[[], Sim3Estimate], int]], one: list[SharedFrame], full: list[SharedFrame]
+) -> tuple[float, float]:
+    """Seconds of one anchor and of the whole overlap, with the same number of passes over all points."""
+    kept = estimation._CONVERGED
+    estimation._CONVERGED = 0.0
+    try:
+        calls = [estimator(frames, max_iterations=FIXED_PASSES)[0] for frames in (one, full)]
+        assert all(call().iterations == FIXED_PASSES for call in calls)
+        return cost(calls[0], 40), cost(calls[1], 5)
+    finally:
+        estimation._CONVERGED = kept
+
+
 def bench_cost() -> None:
     frames, truth, _ = overlap(0)
     config = RegistrationConfig(confidence_value=0.0)
     middle = [frames[OVERLAP // 2]]
     start = sim3.exp(np.random.default_rng(1).normal(0, 0.02, 7)) @ truth
 
-    def estimator(chosen: list[SharedFrame]) -> tuple[Callable[[], Sim3Estimate], int]:
+    def estimator(chosen: list[SharedFrame], **changes: int) -> tuple[Callable[[], Sim3Estimate], int]:
+        settings = config.model_copy(update=changes)
         x, y, depth = points_of(chosen)
         weights = np.ones(len(x), np.float32)
-        return lambda: estimate_sim3(x, y, weights, depth, start, config, frame_count=len(chosen)), len(x)
+        return lambda: estimate_sim3(x, y, weights, depth, start, settings, frame_count=len(chosen)), len(x)
 
     one, one_points = estimator(middle)
     full, full_points = estimator(frames)
@@ -134,12 +151,18 @@ def bench_cost() -> None:
     one_s, full_s = cost(one, 40), cost(full, 5)
     iterations, full_iterations = one().iterations, full().iterations
     passes = iterations + 2  # gathering, the iterations, the score
+    fixed_s, fixed_full_s = fixed_passes(estimator, middle, frames)
     read_s = cost(lambda: [array.sum() for _ in range(passes) for array in (x, y, depth, depth)], 40)
     print("\nEstimator alone (closed form re-weighted until it stands still, 7x7 information), one thread")
     print("| anchor | points | iterations | ms | times window1 |")
     print("|---|---:|---:|---:|---:|")
     print(f"| window1 | {one_points} | {iterations} | {1e3 * one_s:.2f} | 1 |")
     print(f"| full, {OVERLAP} frames | {full_points} | {full_iterations} | {1e3 * full_s:.1f} | {full_s / one_s:.1f} |")
+    print(f"| window1 | {one_points} | exactly {FIXED_PASSES} | {1e3 * fixed_s:.2f} | 1 |")
+    print(
+        f"| full, {OVERLAP} frames | {full_points} | exactly {FIXED_PASSES} | {1e3 * fixed_full_s:.1f} "
+        f"| {fixed_full_s / fixed_s:.1f} |"
+    )
     print(
         f"Reading the arrays {passes} times: {1e3 * read_s:.2f} ms; window1 takes {one_s / read_s:.1f} times as long."
     )

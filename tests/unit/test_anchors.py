@@ -9,9 +9,12 @@ import pytest
 
 from street import SMALL_CAMERA, drive, view
 from vggt_motion.bus import codec
+from vggt_motion.bus.depth import decode_depth, encode_depth
 from vggt_motion.config import RegistrationConfig
 from vggt_motion.geometry import se3, sim3
 from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame
+from vggt_motion.inference.sky import SkyMasking
 from vggt_motion.records import Constraint, ConstraintKind, RegistrationSpec
 from vggt_motion.registration.anchors import AnchorView, SharedFrame, register
 
@@ -271,3 +274,66 @@ def test_a_submap_that_only_turned_is_not_joined_against_its_rotations() -> None
         pose = frame.in_j.submap_from_camera @ se3.make(se3.so3_exp(np.array([0.0, 0.2 * (-1) ** k, 0.0])), np.zeros(3))
         frames[k] = spoil(frame, submap_from_camera=pose)
     assert not register(spec_of(), frames, RegistrationConfig()).accepted
+
+
+class _Named:
+    """As much of a predictor as the masking of a single frame needs."""
+
+    name = "stub"
+
+
+class _WholeSkyAbove:
+    """A segmenter that takes the upper rows for sky."""
+
+    rows = 15
+
+    def sky(self, pixels: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
+        mask = np.zeros((height_px, width_px), dtype=np.bool_)
+        mask[: self.rows] = True
+        return mask
+
+
+def test_sky_that_a_predictor_or_the_sky_model_found_takes_no_part() -> None:
+    """Networks give sky a confident and arbitrary depth; masked, encoded and decoded, none of it reaches the fit."""
+    rng = np.random.default_rng(0)
+    frames = overlap()
+
+    def through_the_wire(view: AnchorView, *, is_masked: bool) -> AnchorView:
+        depth = view.depth.copy()
+        depth[: _WholeSkyAbove.rows] = rng.uniform(100, 900, (_WholeSkyAbove.rows, depth.shape[1]))
+        predicted = PredictedFrame(0, depth, view.confidence, view.intrinsics, view.submap_from_camera)
+        if is_masked:
+            masking = SkyMasking(_Named(), _WholeSkyAbove())  # type: ignore[arg-type]
+            image = KeyframeImage("k", 0, np.zeros((48, 160, 3), np.uint8))
+            predicted = masking._masked(predicted, image)
+        depth, confidence = decode_depth(encode_depth(predicted.depth, predicted.confidence))
+        return replace(view, depth=depth, confidence=confidence)
+
+    def seen(*, is_masked: bool) -> Constraint:
+        shared = [
+            SharedFrame(
+                f.keyframe_id,
+                through_the_wire(f.in_i, is_masked=is_masked),
+                through_the_wire(f.in_j, is_masked=is_masked),
+            )
+            for f in frames
+        ]
+        return register(spec_of(), shared, CONFIG)
+
+    masked, plain = seen(is_masked=True), seen(is_masked=False)
+    surface = SMALL_CAMERA.width_px * (SMALL_CAMERA.height_px - _WholeSkyAbove.rows)
+    assert masked.accepted and masked.point_count == surface and masked.inlier_ratio == 1.0
+    assert close(masked.j_from_i, 1e-3, 2e-2, 1e-3)
+    assert plain.point_count > surface and plain.inlier_ratio < 0.8
+
+
+def test_the_baseline_of_the_peers_is_a_configuration() -> None:
+    """The whole overlap, absolute Huber residuals of width 0.1, five iterations, least-squares scale."""
+    peers = CONFIG.model_copy(
+        update={"anchor": "full", "residual": "absolute", "max_iterations": 5, "scale_rule": "least_squares"}
+    )
+    assert peers.huber_absolute == 0.1
+    constraint = register(spec_of(), overlap(noise=0.01), peers)
+    assert constraint.accepted and [attempt.anchor for attempt in constraint.attempts] == ["full"]
+    assert constraint.attempts[0].keyframe_ids == tuple(f"k{k}" for k in range(5))
+    assert close(constraint.j_from_i, 0.005, 0.1, 0.01)
