@@ -15,6 +15,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 
 import gtsam
+import numpy as np
 
 from vggt_motion.backend import posegraph
 from vggt_motion.backend.factors import (
@@ -32,6 +33,7 @@ from vggt_motion.backend.factors import (
 from vggt_motion.config import BackendConfig
 from vggt_motion.errors import OptimizationError
 from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.geometry.sim3_batch import Sim3Batch
 from vggt_motion.records import Constraint, ConstraintKind, EdgeReport, GraphUpdate, SubmapPose
 
 _LOG = logging.getLogger(__name__)
@@ -109,10 +111,13 @@ class LiveGraph:
             if root not in self._component:
                 poses.append(SubmapPose(root, self._revisions[root], root, Sim3.identity()))
                 continue
-            gauge = estimated(values, root, self._size).inverse()
-            for index in indices:
-                pose = gauge @ estimated(values, index, self._size) if index != root else Sim3.identity()
-                poses.append(SubmapPose(index, self._revisions[index], root, pose))
+            found = Sim3Batch.of([estimated(values, index, self._size) for index in indices])
+            moved = (found.take(np.zeros(1, np.intp)).inverse() @ found).to_list()
+            moved[0] = Sim3.identity()  # without rounding
+            poses.extend(
+                SubmapPose(index, self._revisions[index], root, pose)
+                for index, pose in zip(indices, moved, strict=True)
+            )
         reports, cost = [], 0.0
         for edge_id, factor in sorted(self._factors.items()):
             left = (2.0 * factor.error(values)) ** 0.5

@@ -5,14 +5,15 @@ The direction of constraints and residuals is explained in :mod:`vggt_motion.bac
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vggt_motion.backend.factors import Edge, Loss
 from vggt_motion.backend.robust import solve_component
 from vggt_motion.config import BackendConfig
 from vggt_motion.geometry.sim3 import Sim3
+from vggt_motion.geometry.sim3_batch import Sim3Batch
 from vggt_motion.records import Constraint, ConstraintKind, EdgeReport, GraphUpdate, SubmapPose
 
 
@@ -21,7 +22,8 @@ def chain(nodes: Sequence[tuple[int, int]], constraints: Sequence[Constraint]) -
 
     The first submap of each connected part is the identity. The result does not depend on the order of the arguments.
     """
-    return _components(_latest(nodes), _usable(_latest(nodes), constraints)).start
+    usable = _usable(_latest(nodes), constraints)
+    return _start(_components(_latest(nodes), usable), _orthonormal(usable))
 
 
 def solve(
@@ -55,13 +57,16 @@ def solve(
     latest = _latest(nodes)
     usable = _usable(latest, constraints)
     parts = _components(latest, usable)
+    transforms = _orthonormal(usable)
+    start = _start(parts, transforms)
     poses: dict[int, Sim3] = {}
     edges: list[EdgeReport] = []
     cost = 0.0
-    inside: dict[int, list[Constraint]] = defaultdict(list)
-    for constraint in usable:
-        if parts.root[constraint.spec.i] == parts.root[constraint.spec.j]:
-            inside[parts.root[constraint.spec.i]].append(constraint)
+    inside: dict[tuple[int, ConstraintKind], list[Edge]] = defaultdict(list)
+    for constraint, j_from_i in zip(usable, transforms, strict=True):
+        root = parts.root[constraint.spec.i]
+        if root == parts.root[constraint.spec.j]:
+            inside[root, constraint.spec.kind].append(_edge(constraint, j_from_i, config))
         else:
             edges.append(EdgeReport(constraint.record_id, float("nan"), is_used=False, robust_weight=0.0))
     members: dict[int, list[int]] = defaultdict(list)
@@ -69,14 +74,16 @@ def solve(
         members[parts.root[index]].append(index)
     for root, indices in members.items():
         solution = solve_component(
-            {index: parts.start[index] for index in indices},
-            [to_edge(c, config) for c in inside[root] if c.spec.kind is ConstraintKind.ADJACENT],
-            [to_edge(c, config) for c in inside[root] if c.spec.kind is ConstraintKind.LOOP],
+            {index: start[index] for index in indices},
+            inside[root, ConstraintKind.ADJACENT],
+            inside[root, ConstraintKind.LOOP],
             config,
             is_metric=is_metric,
         )
-        gauge = solution.poses[root].inverse()
-        poses.update({index: gauge @ pose for index, pose in solution.poses.items()} | {root: Sim3.identity()})
+        gauge = Sim3Batch.of([solution.poses[root].inverse()])
+        moved = (gauge @ Sim3Batch.of(list(solution.poses.values()))).to_list()
+        poses.update(zip(solution.poses, moved, strict=True))
+        poses[root] = Sim3.identity()
         edges.extend(solution.reports)
         cost += solution.cost
     return GraphUpdate(
@@ -103,26 +110,31 @@ def to_edge(constraint: Constraint, config: BackendConfig) -> Edge:
     The whole information matrix weights rotation, translation and scale apart; the inlier ratio, the paper's ``w_ij``,
     weights them together.
     """
+    return _edge(constraint, _orthonormal([constraint])[0], config)
+
+
+def _edge(constraint: Constraint, j_from_i: Sim3, config: BackendConfig) -> Edge:
     return Edge(
         constraint.record_id,
         constraint.spec.i,
         constraint.spec.j,
-        _orthonormal(constraint.j_from_i),
+        j_from_i,
         constraint.inlier_ratio * constraint.information,
         Loss("huber", config.huber_sigma),
     )
 
 
-def _orthonormal(transform: Sim3) -> Sim3:
-    """The transform with its rotation's rounding taken out, which a chain of thousands would add up (Newton-Schulz)."""
-    r = transform.rotation
-    return Sim3(1.5 * r - 0.5 * (r @ (r.T @ r)), transform.translation, transform.scale)
+def _orthonormal(constraints: Sequence[Constraint]) -> list[Sim3]:
+    """Their transforms with the rotations' rounding taken out, which a chain of thousands adds up (Newton-Schulz)."""
+    batch = Sim3Batch.of([constraint.j_from_i for constraint in constraints])
+    r = batch.rotation
+    return replace(batch, rotation=1.5 * r - 0.5 * (r @ (r.transpose(0, 2, 1) @ r))).to_list()
 
 
 @dataclass(frozen=True)
 class _Parts:
     root: dict[int, int]  # submap index -> first index of its component
-    start: dict[int, Sim3]
+    steps: list[tuple[int, int, int, bool]]  # known submap, next one, constraint between them, does it lead forward
 
 
 def _latest(nodes: Sequence[tuple[int, int]]) -> dict[int, int]:
@@ -149,27 +161,35 @@ def _usable(latest: Mapping[int, int], constraints: Sequence[Constraint]) -> lis
 
 
 def _components(latest: Mapping[int, int], usable: Sequence[Constraint]) -> _Parts:
-    neighbours: dict[int, list[tuple[int, Constraint]]] = defaultdict(list)
-    for constraint in usable:
+    neighbours: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for number, constraint in enumerate(usable):
         if constraint.spec.kind is ConstraintKind.ADJACENT:
-            neighbours[constraint.spec.i].append((constraint.spec.j, constraint))
-            neighbours[constraint.spec.j].append((constraint.spec.i, constraint))
+            neighbours[constraint.spec.i].append((constraint.spec.j, number))
+            neighbours[constraint.spec.j].append((constraint.spec.i, number))
     root: dict[int, int] = {}
-    start: dict[int, Sim3] = {}
+    steps: list[tuple[int, int, int, bool]] = []
     for first in sorted(latest):
         if first in root:
             continue
-        root[first], start[first] = first, Sim3.identity()
-        queue = [first]
+        root[first] = first
+        queue = deque([first])
         while queue:
-            at = queue.pop(0)
-            for other, constraint in sorted(neighbours[at], key=lambda entry: entry[0]):
+            at = queue.popleft()
+            for other, number in sorted(neighbours[at]):
                 if other not in root:
-                    j_from_i = _orthonormal(constraint.j_from_i)
-                    forward = j_from_i if constraint.spec.i == other else j_from_i.inverse()
-                    root[other], start[other] = first, start[at] @ forward
+                    root[other] = first
+                    steps.append((at, other, number, usable[number].spec.i == at))
                     queue.append(other)
-    return _Parts(root, start)
+    return _Parts(root, steps)
+
+
+def _start(parts: _Parts, transforms: Sequence[Sim3]) -> dict[int, Sim3]:
+    """World poses of all submaps, composed along the steps; ``transforms`` are those of the constraints."""
+    start = {index: Sim3.identity() for index, root in parts.root.items() if index == root}
+    for at, other, number, is_forward in parts.steps:
+        j_from_i = transforms[number]
+        start[other] = start[at] @ (j_from_i.inverse() if is_forward else j_from_i)
+    return start
 
 
 def _breaks(

@@ -61,13 +61,20 @@ class Skeleton:
 
     def _compose(self, ends: Sim3Batch, steps: Sim3Batch) -> Sim3Batch:
         """Poses (N) along the chain: each stretch from its first end, and its second end as the stretch reaches it."""
-        first = {position: n for n, position in enumerate(self.kept.tolist())}
-        poses = [ends[0]]
-        at = ends[0]
-        for position, step in enumerate(steps.to_list(), start=1):
-            poses.append(at @ step)
-            at = ends[first[position]] if position in first else poses[-1]
-        return Sim3Batch.of(poses)
+        count = len(self.members)
+        rotation, translation, scale = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty(count)
+        rotation[0], translation[0], scale[0] = ends.rotation[0], ends.translation[0], ends.scale[0]
+        lengths = np.diff(np.append(self.kept, count - 1))
+        at, alive = ends, np.ones(len(lengths), dtype=np.bool_)
+        # all stretches at once, one submap further each time
+        for offset in range(1, int(lengths.max(initial=0)) + 1):
+            going_on = lengths >= offset
+            starts = self.kept[going_on]
+            at = at.take(np.flatnonzero(going_on[alive])) @ steps.take(starts + offset - 1)
+            alive = going_on
+            places = starts + offset
+            rotation[places], translation[places], scale[places] = at.rotation, at.translation, at.scale
+        return Sim3Batch(rotation, translation, scale)
 
     def _shares(self, placed: Sim3Batch, left: Array) -> Array:
         """Errors (N, 7) of the edges, each in the frame of its end, that sum up to what is ``left`` (M - 1, 7).
