@@ -1,10 +1,10 @@
 """The live pose graph: one constraint at a time, with iSAM2, while the drive goes on (DESIGN 3.6).
 
-Chosen by measurement over the warm-started batch, which costs a second and more per constraint at 10,000 submaps where
-this costs milliseconds, and a tenth of a second for a loop (tests/benchmarks/bench_posegraph.py). What a loop moves is
-linearised anew only then. Small graphs are built again from a batch solve for every loop, which judges the loops
-better and costs no more there. iSAM2's QR costs ten times its Cholesky, which may meet a system that it cannot factor:
-then the graph is built again too. The live estimate is for looking at: the final one is always a fresh batch
+Chosen by measurement over the warm-started batch, which at 10,000 submaps takes half a second for a submap and a second
+for a loop, where this takes milliseconds and a tenth of a second (tests/benchmarks/bench_posegraph.py). What a loop
+moves is linearised anew only then. Small graphs are built again from a batch solve for every loop, which judges the
+loops better and costs no more there. iSAM2's QR costs ten times its Cholesky, which may meet a system that it cannot
+factor: then the graph is built again too. The live estimate is for looking at: the final one is always a fresh batch
 (posegraph.solve).
 """
 
