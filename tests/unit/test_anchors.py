@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -337,3 +339,15 @@ def test_the_baseline_of_the_peers_is_a_configuration() -> None:
     assert constraint.accepted and [attempt.anchor for attempt in constraint.attempts] == ["full"]
     assert constraint.attempts[0].keyframe_ids == tuple(f"k{k}" for k in range(5))
     assert close(constraint.j_from_i, 0.005, 0.1, 0.01)
+
+
+def test_the_kernels_are_loaded_before_the_first_job() -> None:
+    script = """
+from vggt_motion.config import RegistrationConfig
+from vggt_motion.registration.task import load_kernels
+load_kernels(RegistrationConfig())
+from vggt_motion.registration import kernels
+print(*(len(kernel.signatures) for kernel in (kernels.unproject_pair, kernels.accumulate, kernels.score)))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "1", "1"]

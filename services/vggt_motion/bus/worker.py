@@ -19,6 +19,7 @@ _log = logging.getLogger(__name__)
 _CLAIM_WAIT_S = 1.0
 _RETRY_S = 0.5
 _HEARTBEATS_PER_LEASE = 4
+_WARM_UP_DEADLINE_S = 1800.0  # no job waits for it, and compilation on a busy machine takes minutes
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def _warm_up(context: ServiceContext, child: ComputeChild, warm_up: Computation,
         child.call(
             warm_up.function,
             *warm_up.arguments,
-            deadline_s=deadline_s,
+            deadline_s=max(deadline_s, _WARM_UP_DEADLINE_S),
             on_tick=lambda: not context.stopping.is_set(),
         )
     except ComputeCancelledError:

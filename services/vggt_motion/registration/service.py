@@ -7,7 +7,7 @@ from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.bus.worker import BlobCache, Computation, work
 from vggt_motion.config import Config
 from vggt_motion.records import JobKind, Lease, RegisterTask, Stream
-from vggt_motion.registration.task import register_submaps
+from vggt_motion.registration.task import load_kernels, register_submaps
 
 
 def main(config: Config) -> int:
@@ -31,4 +31,5 @@ def _serve(context: ServiceContext) -> None:
         stream=Stream.CONSTRAINT,
         prepare=prepare,
         deadline_s=context.config.registration.job_deadline_s,
+        warm_up=Computation(load_kernels, (context.config.registration,), detail="loading the kernels"),
     )
