@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -24,6 +25,7 @@ Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 MAX_NEIGHBOURS = 4
+_THREADS = 2  # one worker keeps two cores busy here; the result does not depend on it
 _REACH = 6  # keyframes to either side that are considered as neighbours
 _BEST_PARALLAX_PX = 8.0  # at the lattice: enough to see depth, little enough to look alike
 _PARALLAX_LOG_WIDTH = 0.9
@@ -68,18 +70,23 @@ def dense_depth(
     positions = sorted(grey)
     images = {position: grey[position].astype(np.float32) for position in positions}
     nearest = _nearest_inverse_depths(sparse)
-    matched: dict[int, stereo.Stereo] = {}
-    neighbours: dict[int, list[int]] = {}
-    for position in positions:
-        neighbours[position] = _neighbours(position, positions, camera_from_submap, sparse[position], intrinsics)
-        if not neighbours[position]:
-            continue
+    neighbours = {
+        position: _neighbours(position, positions, camera_from_submap, sparse[position], intrinsics)
+        for position in positions
+    }
+
+    def match(position: int) -> stereo.Stereo:
         views = [
             stereo.View(images[other], camera_from_submap[other] @ se3.inverse(camera_from_submap[position]))
             for other in neighbours[position]
         ]
         count = _hypotheses(views, sparse[position], intrinsics, nearest[position])
-        matched[position] = stereo.match(images[position], views, intrinsics, nearest[position], count)
+        return stereo.match(images[position], views, intrinsics, nearest[position], count)
+
+    # the kernels leave the interpreter's lock, and no frame's matching depends on another's
+    matchable = [position for position in positions if neighbours[position]]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        matched = dict(zip(matchable, pool.map(match, matchable), strict=True))
     sigma = {position: _relative_sigma(matched[position]) for position in matched}
     rays = pixel_rays(intrinsics)
     camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1])

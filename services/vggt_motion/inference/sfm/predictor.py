@@ -32,9 +32,11 @@ _MAX_DISAGREEMENT = 0.03  # of the path, between solutions found in different wa
 _MIN_MATCHES = 12
 _MATCH_REACH = 4  # keyframes that are matched with each other at most so far apart
 _STILL_PX = 1.0  # matches that a rotation explains this well carry no parallax
+_TURNING_PX = 0.4  # the same within a submap whose camera is known: as little as tracking errs
 _FALLBACK_FOCAL_OVER_WIDTH = 0.9
 _DOUBTFUL_CONFIDENCE = 0.6  # of a doubtful submap: only its best points are left to the map
 _PART_RELATIVE_SIGMA = 0.01  # of the focal length that the whole submap saw, for its parts
+_COMPANION = "something that moves along fills the view"
 _NO_DEPTH = "the camera did not move enough to see any depth"
 _MAX_VANISHED = 0.35  # share of the image that may lose its points over a step while the camera only turns
 _COMPANION_PX = 3.0
@@ -121,14 +123,13 @@ class _Submap:
         focal_px = self._hint.focal_over_width * working.width_px if self._hint is not None else None
         turned = rotation.fit_rotations(matched, originals, focal_px, working.width_px)
         self._seconds["rotation_s"] = time.perf_counter() - started
-        has_companion = False
+        rest: tracks.Tracks | None = None
         if turned is not None and turned.residual_px < _STILL_PX:
             vanished = tracks.vanished_share(followed, originals, working.width_px)
             if vanished < _MAX_VANISHED:
                 return self._rotation_only(turned, working)
             # what stays where it is fills the view and moves along, as a truck ahead: look at the rest
-            has_companion = True
-            followed = self._without_companions(turned, originals, working)
+            followed = rest = self._without_companions(turned, originals, working)
         # 4. structure
         started = time.perf_counter()
         first, attempts = structure.solve(followed, originals, working, self._prior())
@@ -137,21 +138,22 @@ class _Submap:
             joined = self._solve_in_parts(first, followed, originals, working)
             if joined is not None:
                 return replace(joined, stage_seconds=self._seconds | {"parts_s": time.perf_counter() - started})
-        solved, doubt = self._solve(first, originals, working)
+        solved, doubt = self._solve(first, originals, working, rest)
         self._seconds["structure_s"] = time.perf_counter() - started
         if solved is None:
-            return self._failed("structure from motion found no scene that the keyframes agree on")
+            nothing = "structure from motion found no scene that the keyframes agree on"
+            return self._failed(nothing if rest is None else f"{_COMPANION}, and beside it {nothing}")
         judgement, reason = verdict.judge(solved, len(originals))
         if judgement is SubmapVerdict.FAILED:
-            return self._failed(reason)
-        if has_companion:
-            doubt = "; ".join(part for part in (doubt, "something that moves along fills the view") if part)
+            return self._failed(reason if rest is None else f"{_COMPANION}, and beside it {reason}")
+        if rest is not None:
+            doubt = "; ".join(part for part in (doubt, _COMPANION) if part)
         if doubt:
             judgement, reason = SubmapVerdict.LOW_QUALITY, "; ".join(part for part in (reason, doubt) if part)
         # 5. depth, and the frames in which the camera only turned
         started = time.perf_counter()
         frames = self._frames(solved, working)
-        turned_frames = self._turned_frames(frames, followed, originals, solved, working)
+        turned_frames = self._turned_frames(frames, followed, originals, solved, working) if rest is None else []
         self._seconds["depth_s"] = time.perf_counter() - started
         if turned_frames:
             frames = tuple(sorted((*frames, *turned_frames), key=lambda frame: frame.position))
@@ -160,18 +162,23 @@ class _Submap:
         return self._prediction(frames, judgement, reason, self._quality(solved, len(frames), working))
 
     def _solve(
-        self, solved: structure.Structure | None, originals: Sequence[int], working: images.WorkingImages
+        self,
+        solved: structure.Structure | None,
+        originals: Sequence[int],
+        working: images.WorkingImages,
+        rest: tracks.Tracks | None,
     ) -> tuple[structure.Structure | None, str]:
         """The structure, and what speaks against it beside its own quality.
 
         Where the fast way leaves doubts, matched features are tried as well, grown and mapped all at once: ways that
-        have little in common but the images, so that their agreement means something.
+        have little in common but the images, so that their agreement means something. ``rest`` are the matches to use,
+        where some are left out.
         """
         prior, count = self._prior(), len(originals)
         if solved is not None and verdict.is_convincing(solved, count):
             return solved, ""
         candidates = [solved]
-        matched = tracks.match(working, originals)
+        matched = rest if rest is not None else tracks.match(working, originals)
         again, attempts = structure.solve(matched, originals, working, prior)
         self._attempts.extend(f"matched features, {attempt}" for attempt in attempts)
         candidates.append(again)
@@ -199,7 +206,7 @@ class _Submap:
         bundle adjustment finds some. What comes after is put where the camera stands, in the unit of its own steps.
         """
         camera = _intrinsics(solved.scene, working)
-        parts = rotation.split(_matched(followed, originals, camera), originals, camera.fx, _STILL_PX)
+        parts = rotation.split(_matched(followed, originals, camera), originals, camera.fx, _TURNING_PX)
         if not any(part.is_turning for part in parts):
             return None
         hint = self._hint

@@ -104,10 +104,12 @@ def solve(
         best = _better(best, again)
     if best is None:
         return None, attempts
-    if not prior.is_fixed and best.registered.sum() > 2:
+    deviations = abs(best.scene.radial_k1 - prior.radial_k1) / calibration.sigma[1]
+    # where the camera is known and its lens not contradicted, another lens is not worth its time
+    if not prior.is_fixed and best.registered.sum() > 2 and (not prior.is_sure or deviations > 1.0):
         wide = prior.calibration(width_px, is_unrectified=True)
         distorted = _adjusted(observations, best.registered, positions, width_px, best.scene, wide)
-        contradicted = abs(best.scene.radial_k1 - prior.radial_k1) > 2.0 * calibration.sigma[1]
+        contradicted = deviations > 2.0
         if (
             distorted is not None
             and abs(distorted.scene.radial_k1) < _MAX_K1

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -88,21 +89,19 @@ def vanished_share(tracks: Tracks, positions: Sequence[int], width_px: int) -> f
 
 def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
     """Follow corners from keyframe to keyframe; new ones start where none is left."""
-    create: Any = getattr(cv2, "DISOpticalFlow_create")  # noqa: B009  -- missing in the stubs of OpenCV 5
-    estimator = create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     height, width = working.height_px, working.width_px
     ids = np.zeros(0, dtype=np.int64)
     pixels = np.zeros((0, 2), dtype=np.float32)
     next_id = 0
     rows: list[tuple[Index, int, Points]] = []
     lost: list[tuple[int, Points]] = []
-    for a, b in itertools.pairwise(positions):
+    flows = _flows(working, positions)
+    for (a, b), flow in zip(itertools.pairwise(positions), flows, strict=True):
         fresh = _corners(working.grey[a], working.usable, pixels)
         ids = np.concatenate([ids, np.arange(next_id, next_id + len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         rows.append((ids[len(ids) - len(fresh) :], a, fresh))
         next_id += len(fresh)
-        flow = estimator.calc(working.grey[a], working.grey[b], None)
         moved, kept = _track(working.grey[a], working.grey[b], pixels, pixels + _sample(flow, pixels))
         inside = np.all((moved >= _BORDER_PX) & (moved <= np.array([width, height]) - 1 - _BORDER_PX), axis=1)
         kept &= inside
@@ -124,6 +123,18 @@ def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
         lost_frame=np.concatenate([np.full(len(where), a, dtype=np.int64) for a, where in lost]),
         lost_pixel=np.concatenate([where for _, where in lost]).astype(np.float64),
     )
+
+
+def _flows(working: WorkingImages, positions: Sequence[int]) -> list[npt.NDArray[np.float32]]:
+    """Dense flow (H, W, 2) between neighbours, two pairs at a time: the library leaves the interpreter's lock."""
+    create: Any = getattr(cv2, "DISOpticalFlow_create")  # noqa: B009  -- missing in the stubs of OpenCV 5
+
+    def flow(pair: tuple[int, int]) -> npt.NDArray[np.float32]:
+        estimator = create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # holds buffers: one for each call
+        return np.asarray(estimator.calc(working.grey[pair[0]], working.grey[pair[1]], None), dtype=np.float32)
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(flow, itertools.pairwise(positions)))
 
 
 def match(working: WorkingImages, positions: Sequence[int], reach: int = 4) -> Tracks:
@@ -224,12 +235,22 @@ def _track(a: GreyImage, b: GreyImage, pixels: Points, guess: Points) -> tuple[P
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
     size = (_WINDOW_PX, _WINDOW_PX)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        a, b, pixels, guess.astype(np.float32), winSize=size, maxLevel=_PYRAMID_LEVELS, criteria=criteria, flags=flags
-    )
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(
-        b, a, moved, pixels.copy(), winSize=size, maxLevel=_PYRAMID_LEVELS, criteria=criteria, flags=flags
-    )
+
+    def there_and_back(some: slice) -> tuple[Points, npt.NDArray[np.uint8], Points, npt.NDArray[np.uint8]]:
+        start, to = pixels[some].copy(), guess[some].astype(np.float32)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(
+            a, b, start, to, winSize=size, maxLevel=_PYRAMID_LEVELS, criteria=criteria, flags=flags
+        )
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+            b, a, there, start.copy(), winSize=size, maxLevel=_PYRAMID_LEVELS, criteria=criteria, flags=flags
+        )
+        return tuple(np.asarray(part) for part in (there, found, back, returned))  # type: ignore[return-value]
+
+    half = len(pixels) // 2
+    halves = [some for some in (slice(0, half), slice(half, None)) if len(pixels[some])]
+    with ThreadPoolExecutor(2) as pool:  # no point's track depends on another's
+        parts = list(pool.map(there_and_back, halves))
+    moved, found, back, returned = (np.concatenate([part[k] for part in parts]) for k in range(4))
     close = np.linalg.norm(back - pixels, axis=1) < _ROUND_TRIP_PX
     return np.asarray(moved, dtype=np.float32), np.asarray(
         (found.ravel() > 0) & (returned.ravel() > 0) & close & np.isfinite(moved).all(axis=1), dtype=np.bool_
