@@ -63,7 +63,7 @@ def report(name: str, location: Path, run: OfflineRun) -> str:
     graph = state.latest_graph()
     truth = truth_of(location, run)
     errors = ("-", "-", "-")
-    if truth is not None:
+    if truth is not None and len(run.trajectory.track("all")) > 2:
         ate = metrics.evaluate(truth, run.trajectory.track("all")).ate_sim3
         errors = (f"{ate.position_m.rmse:.3f}", f"{ate.position_m.max:.3f}", f"{ate.drift_ate_percent:.2f}")
     frames = run.trajectory.frames
