@@ -8,6 +8,7 @@ import json
 import logging
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus, open_bus
 from vggt_motion.config import BusConfig, Config
-from vggt_motion.errors import BusError, InputError, VggtMotionError
+from vggt_motion.errors import BusError, BusUnavailableError, InputError, VggtMotionError
 from vggt_motion.gateway.security import check_exposure
 from vggt_motion.inference.registry import choose_predictor
 from vggt_motion.ledger.sessions import SessionIdentity
@@ -245,7 +246,8 @@ class LocalRun:
                     start_up_seconds=start_up_seconds,
                     restart_count=supervisor.restart_count,
                 )
-                finish(outcome, bus)
+                with _supervised(supervisor, bus):
+                    finish(outcome, bus)
             finally:
                 bus.close()
         return outcome
@@ -350,6 +352,36 @@ class LocalRun:
             dead_jobs=len(state.dead_jobs),
             is_input_complete=state.is_input_complete,
         )
+
+
+@contextlib.contextmanager
+def _supervised(supervisor: Supervisor, bus: Bus) -> Iterator[None]:
+    """Keep the services running while this thread is busy with the results: the ledger that it asks may be killed too.
+
+    Raises:
+        VggtMotionError: a service keeps crashing.
+    """
+    is_over = threading.Event()
+    failure: list[VggtMotionError] = []
+
+    def watch() -> None:
+        while not is_over.wait(_TICK_S):
+            try:
+                supervisor.poll()
+            except VggtMotionError as error:
+                failure.append(error)
+                bus.interrupt()  # whoever waits for the service that is given up
+                return
+
+    thread = threading.Thread(target=watch, name="supervise", daemon=True)
+    thread.start()
+    try:
+        yield
+    except BusUnavailableError as error:
+        raise (failure[0] if failure else error) from None
+    finally:
+        is_over.set()
+        thread.join()
 
 
 class _RecorderProgress:

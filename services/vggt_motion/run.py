@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 import time
@@ -17,14 +18,18 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from vggt_motion import launch, results
 from vggt_motion.bus.jobs import JobClient
 from vggt_motion.bus.ledger import LedgerClient
+from vggt_motion.bus.retry import retry
 from vggt_motion.bus.session import Bus
-from vggt_motion.errors import InputError, SourceTruncatedError
+from vggt_motion.errors import DiskFullError, InputError, SourceTruncatedError
 from vggt_motion.geometry.track import PoseTrack
 from vggt_motion.ledger.directory import locked
 from vggt_motion.ledger.sessions import SessionState, prepare_session, remove_session
-from vggt_motion.records import Event, EventKind, JobState, MotionState, Stream
+from vggt_motion.records import Event, EventKind, JobReport, JobState, MotionState, Stream
 
 INTERRUPTED_EXIT_CODE = 130
+_DISK_RETRY_S = 1.0
+_INTERRUPTED_PATIENCE_S = 15.0
+_PATIENCE_S = 120.0  # a ledger that is killed now is started again, or the run is ended as a crash loop
 _FILES = (
     results.METRICS_FILE,
     launch.CONFIG_FILE,
@@ -67,8 +72,7 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     def finish(outcome: launch.RunOutcome, bus: Bus) -> None:
         metrics.update(_write_results(request, run, outcome, bus, reference))
         if metrics["is_complete"]:
-            event = Event("run_ended", EventKind.RUN_ENDED, "the run ended by itself", time.time_ns())
-            LedgerClient(bus).append(Stream.EVENT, event.event_id, event)
+            _append_run_ended(bus, console)
 
     with _display(console, run.source_description) as on_progress:
         outcome = run.execute(on_progress, finish)
@@ -81,6 +85,22 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     if outcome.exit_code == SourceTruncatedError.exit_code:
         console.print(f"The input ended early: {escape(metrics['truncated'])}")
     return outcome.exit_code
+
+
+def _append_run_ended(bus: Bus, console: Console) -> None:
+    """Close the session in its log; without space on the disk, as soon as there is some."""
+    event = Event("run_ended", EventKind.RUN_ENDED, "the run ended by itself", time.time_ns())
+    is_told = False
+    while True:
+        try:
+            LedgerClient(bus).append(Stream.EVENT, event.event_id, event)
+            return
+        except DiskFullError as error:
+            if not is_told:
+                is_told = True
+                console.print(f"The results are written. Waiting to close the session: {escape(str(error))}")
+            if bus.wait(_DISK_RETRY_S):
+                raise
 
 
 def _claim_folder(request: launch.RunRequest, run: launch.LocalRun, *, fresh: bool) -> dict[str, Any] | None:
@@ -117,6 +137,12 @@ def _write_results(
     bus: Bus,
     reference: PoseTrack | list[PoseTrack] | None,
 ) -> dict[str, Any]:
+    # After Ctrl-C what can be had soon must do.
+    patience_s = _INTERRUPTED_PATIENCE_S if outcome.interrupted else _PATIENCE_S
+    dead_jobs: list[JobReport] = []
+    if outcome.state.dead_jobs:
+        ask = functools.partial(JobClient(bus).reports, JobState.DEAD)
+        dead_jobs = retry(bus, ask, patience_s=patience_s, what="the jobs that were given up")
     facts = results.RunFacts(
         source=run.source_description,
         exit_code=INTERRUPTED_EXIT_CODE if outcome.interrupted else outcome.exit_code,
@@ -128,9 +154,9 @@ def _write_results(
         predictor_reason=run.config.inference.predictor_reason,
         first_frame=request.start,
         stride=request.stride,
-        dead_jobs=tuple(JobClient(bus).reports(JobState.DEAD)) if outcome.state.dead_jobs else (),
+        dead_jobs=tuple(dead_jobs),
     )
-    load_blob = LedgerClient(bus).blob
+    load_blob = functools.partial(LedgerClient(bus).blob, patience_s=patience_s)
     return results.write_results(request.out, outcome.state, run.config, facts, load_blob, reference)
 
 
