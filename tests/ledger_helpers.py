@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,25 @@ from vggt_motion.ledger.store import NewRecord
 from vggt_motion.records import Job, JobKind, JobReport
 
 RESULT_STREAMS = {"describe": "descriptor", "predict": "submap", "register": "constraint"}
+
+
+def damage_blob(directory: Path, sha256: str, content: bytes) -> None:
+    """Put other bytes in the place of a blob, wherever the ledger keeps it; nobody may serve the session."""
+    with contextlib.closing(sqlite3.connect(directory / "ledger.db")) as connection:
+        changed = connection.execute("UPDATE contents SET content = ? WHERE sha256 = ?", (content, sha256)).rowcount
+        connection.commit()
+    path = directory / "blobs" / sha256
+    if path.is_file():
+        path.write_bytes(content)
+        changed += 1
+    assert changed == 1, sha256
+
+
+def stored_blobs(directory: Path) -> set[str]:
+    """SHA-256 of every blob that is kept, whether a record refers to it or not."""
+    with contextlib.closing(sqlite3.connect(f"{(directory / 'ledger.db').as_uri()}?mode=ro", uri=True)) as connection:
+        names = {str(row[0]) for row in connection.execute("SELECT sha256 FROM contents")}
+    return names | {path.name for path in (directory / "blobs").rglob("*") if path.is_file()}
 
 
 class Clock:
@@ -47,6 +68,7 @@ def open_ledger(directory: Path, clock: Clock | None = None, **options: Any) -> 
     counter = itertools.count()
     options.setdefault("new_lease_id", lambda: f"lease{next(counter)}")
     options.setdefault("policy", JobPolicy())
+    options.setdefault("inline_blob_bytes", 0)  # blobs are files unless a test is about those that are not
     return Ledger(
         directory,
         input_streams={"keyframe"},

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import ledger_processes
+from ledger_helpers import damage_blob
 from vggt_motion.config import LedgerConfig
 from vggt_motion.ledger.check import check
 from vggt_motion.ledger.service import open_session
@@ -70,8 +71,7 @@ def test_a_torn_blob_is_found_by_the_check_and_not_handed_out(tmp_path: Path) ->
     directory = tmp_path / "session"
     records = acknowledged_until_killed(directory, 1, 0.05)
     _, record_id, sha256 = records[0]
-    path = directory / "blobs" / sha256
-    path.write_bytes(path.read_bytes()[:10])
+    damage_blob(directory, sha256, b"torn")
     report = check(directory)
     assert len(report.problems) == 1 and record_id in report.problems[0]
     shutil.rmtree(directory)

@@ -22,6 +22,7 @@ from vggt_motion.inference.predictor import KeyframeImage, PredictionHints  # no
 from vggt_motion.inference.registry import create_predictor  # noqa: E402
 from vggt_motion.inference.vggt.architecture import SMALL  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
+from vggt_motion.ledger.directory import stored_blob  # noqa: E402
 from vggt_motion.records import SubmapGeometry, SubmapVerdict  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -44,8 +45,7 @@ def submaps(out: Path) -> list[SubmapGeometry]:
 
 
 def blob(out: Path, sha256: str) -> bytes:
-    (file,) = (path for path in (out / "ledger" / "blobs").rglob("*") if path.is_file() and sha256 in path.name)
-    return file.read_bytes()
+    return stored_blob(out / "ledger", sha256)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

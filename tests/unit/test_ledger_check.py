@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ledger_helpers import open_ledger, predict, record
+from ledger_helpers import damage_blob, open_ledger, predict, record
 from vggt_motion.bus import codec
 from vggt_motion.errors import InputError, LedgerError
 from vggt_motion.ledger.check import check
@@ -113,6 +113,28 @@ def test_a_damaged_blob_is_named_set_aside_and_healed_by_appending_again(session
     (problem,) = check(session).problems
     assert "is missing" in problem
     ledger = open_ledger(session)
+    assert ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")]).was_known
+    ledger.close()
+    assert check(session).is_sound
+
+
+def test_a_damaged_small_blob_is_named_set_aside_and_healed_by_appending_again(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    ledger = open_ledger(session, inline_blob_bytes=100)
+    ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")])
+    ledger.close()
+    report = check(session)
+    assert report.is_sound and report.blob_count == 1
+    assert report.stored_bytes == (session / "ledger.db").stat().st_size
+    damage_blob(session, entry(b"image").sha256, b"imagE")
+    assert not check(session, repair=False).is_sound
+    with pytest.raises(LedgerError, match="damaged"):
+        export_session(session, tmp_path / "session.tar")
+    (problem,) = check(session).problems
+    assert problem.startswith(f"keyframe/0 ('k0'): blob {entry(b'image').sha256} is damaged")
+    (problem,) = check(session).problems
+    assert "is missing" in problem
+    ledger = open_ledger(session, inline_blob_bytes=100)
     assert ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")]).was_known
     ledger.close()
     assert check(session).is_sound
@@ -259,18 +281,20 @@ def test_a_session_in_use_is_not_removed(session: Path) -> None:
 
 
 def test_a_session_comes_out_of_an_archive_as_it_went_in(session: Path, tmp_path: Path) -> None:
-    ledger = open_ledger(session)  # exporting needs no lock
+    ledger = open_ledger(session, inline_blob_bytes=100)  # exporting needs no lock
+    ledger.store.append(record("event", "e0"), [b"small"], [entry(b"small")])
     report = export_session(session, tmp_path / "session.tar")
     ledger.store.append(record("keyframe", "k2"))
     rows = ledger.store.read("keyframe", limit=2)
     ledger.close()
-    assert (report.record_counts, report.blob_count) == ({"keyframe": 2, "submap": 1}, 2)
+    assert (report.record_counts, report.blob_count) == ({"keyframe": 2, "submap": 1, "event": 1}, 3)
     assert report.archive_bytes == (tmp_path / "session.tar").stat().st_size
     assert import_session(tmp_path / "session.tar", tmp_path / "copy") == report
     assert check(tmp_path / "copy").is_sound
     copy = open_ledger(tmp_path / "copy")
     assert copy.store.read("keyframe") == rows
     assert copy.store.blob(entry(b"image").sha256) == b"image"
+    assert copy.store.blob(entry(b"small").sha256) == b"small"
     assert copy.jobs.counts() == {("predict", "done"): 1, ("predict", "open"): 1}
     copy.close()
 

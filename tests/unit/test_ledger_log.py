@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import sqlite3
 import threading
@@ -15,10 +16,20 @@ from hypothesis import strategies as st
 from ledger_helpers import open_ledger, record
 from vggt_motion.errors import DiskFullError, LedgerError, RefusalCode, RequestRefusedError
 from vggt_motion.ledger import log, schema, sqlite
-from vggt_motion.ledger.directory import Ledger
+from vggt_motion.ledger.blobs import BlobFiles
+from vggt_motion.ledger.check import check
+from vggt_motion.ledger.directory import Ledger, stored_blob
 from vggt_motion.ledger.log import Appended, is_intact
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
-from vggt_motion.ledger.store import BlobEntry, ConflictError, InvalidRequestError, NewRecord, Transaction, UnknownError
+from vggt_motion.ledger.store import (
+    BlobEntry,
+    ConflictError,
+    DamagedBlobError,
+    InvalidRequestError,
+    NewRecord,
+    Transaction,
+    UnknownError,
+)
 
 
 @pytest.fixture
@@ -249,6 +260,64 @@ def test_a_stored_row_that_changed_is_not_intact(ledger: Ledger) -> None:
         assert not is_intact(type(row)(**{**row.__dict__, **change}))
 
 
+# Small blobs among the rows
+
+
+def test_small_blobs_stand_among_the_rows_and_large_ones_are_files(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=5)
+    small, large = b"small", b"larger"
+    ledger.store.append(record("keyframe", "a"), [small, large], [entry(small), entry(large)])
+    ledger.store.append(record("keyframe", "b"), [], [entry(small), entry(large)])
+    assert [path.name for path in (tmp_path / "session" / "blobs").glob("*[0-9a-f]")] == [entry(large).sha256]
+    assert ledger.store.sizes().blob_bytes == len(large)
+    ledger.close()
+    again = open_ledger(tmp_path / "session")
+    assert [again.store.blob(entry(data).sha256) for data in (small, large)] == [small, large]
+    assert [stored_blob(tmp_path / "session", entry(data).sha256) for data in (small, large)] == [small, large]
+    again.close()
+    with pytest.raises(UnknownError):
+        stored_blob(tmp_path / "session", entry(b"nothing").sha256)
+
+
+def test_a_small_blob_and_its_record_share_one_commit(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+    gate = Gate(ledger.rows, waiting=15)
+    in_threads(
+        16,
+        lambda index: ledger.store.append(record("keyframe", f"{index}"), [b"%d" % index], [entry(b"%d" % index)]),
+    )
+    assert gate.commit_sizes == [1, 15]
+    ledger.close()
+
+
+def test_a_refused_record_leaves_no_content_behind(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+    ledger.store.append(record("keyframe", "a"))
+    with pytest.raises(ConflictError):
+        ledger.rows.write(
+            lambda transaction: ledger.store.add(
+                transaction, record("keyframe", "a", b"other"), ledger.store.prepare([b"new"], [], is_input=True)
+            )
+        )
+    with pytest.raises(UnknownError):
+        ledger.store.blob(entry(b"new").sha256)
+    ledger.close()
+
+
+def test_a_damaged_small_blob_is_noticed_set_aside_and_healed_by_appending_again(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+    ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image")])
+    ledger.rows.write(lambda transaction: transaction.set_content(entry(b"image").sha256, b"imagE"))
+    with pytest.raises(DamagedBlobError):
+        ledger.store.blob(entry(b"image").sha256)
+    assert (tmp_path / "session" / "blobs" / "damaged" / entry(b"image").sha256).read_bytes() == b"imagE"
+    with pytest.raises(UnknownError):
+        ledger.store.blob(entry(b"image").sha256)
+    assert ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image")]).was_known
+    assert ledger.store.blob(entry(b"image").sha256) == b"image"
+    ledger.close()
+
+
 # Group commit
 
 
@@ -376,6 +445,29 @@ def test_an_older_schema_is_brought_up_to_date(tmp_path: Path, monkeypatch: pyte
     assert ledger.rows.read(lambda reader: reader.find_meta("schema_version")) == str(schema.SCHEMA_VERSION)
     assert ledger.jobs.counts() == {}
     ledger.close()
+
+
+def test_a_session_with_all_blobs_in_files_is_brought_up_to_date_by_looking_at_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Schema 2 knew no small blobs among the rows."""
+    folder = tmp_path / "session"
+    files = BlobFiles(folder / "blobs")
+    (stored,) = files.put([b"image"], keep_free_bytes=0)
+    with monkeypatch.context() as old:
+        old.setattr(sqlite, "MIGRATIONS", schema.MIGRATIONS[:2])
+        old.setattr(sqlite, "SCHEMA_VERSION", 2)
+        SqliteRows(folder / "ledger.db").close()
+        with contextlib.closing(sqlite3.connect(folder / "ledger.db")) as connection, connection:
+            connection.execute("INSERT INTO blobs VALUES (?, ?)", (stored.sha256, stored.size_bytes))
+    with read_only(folder / "ledger.db") as reader:
+        assert reader.file_blob_bytes() == stored.size_bytes
+        assert list(reader.file_blobs()) == [stored]
+    ledger = open_ledger(folder, inline_blob_bytes=100)
+    ledger.store.append(record("keyframe", "a"), [], [stored])
+    assert ledger.store.blob(stored.sha256) == b"image"
+    ledger.close()
+    assert check(folder).is_sound
 
 
 def test_a_newer_schema_is_refused_and_not_touched(tmp_path: Path) -> None:

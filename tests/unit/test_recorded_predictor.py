@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ledger_helpers import damage_blob
 from synthetic_session import Session
 from vggt_motion.bus import codec
 from vggt_motion.bus.ledger import append_request
@@ -71,8 +72,7 @@ def test_unknown_keyframes_are_a_failed_submap(session: Session, tmp_path: Path)
 def test_a_damaged_payload_is_an_error(session: Session, tmp_path: Path) -> None:
     submap = session.submaps[0]
     sha256 = submap.frames[0].depth.sha256
-    (path,) = (tmp_path / "blobs").rglob(sha256)
-    path.write_bytes(b"rotten")
+    damage_blob(tmp_path, sha256, b"rotten")
     predictor = create_predictor("recorded", config(tmp_path))
     with pytest.raises(PredictionError, match="damaged"):
         predictor.predict(images(submap.spec.keyframe_ids), PredictionHints())

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from vggt_motion.bus import codec
 from vggt_motion.config import InferenceConfig, RecordedConfig
-from vggt_motion.errors import ConfigurationError, LedgerError, PredictionError
+from vggt_motion.errors import ConfigurationError, LedgerError, PredictionError, RequestRefusedError
 from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints
-from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME
+from vggt_motion.ledger.directory import DATABASE_NAME, stored_blob
 from vggt_motion.ledger.sqlite import read_only
 from vggt_motion.records import BlobRef, ScaleKind, Stream, SubmapGeometry, SubmapQuality, SubmapVerdict
 
@@ -104,15 +104,12 @@ class RecordedPredictor:
         return max(found, key=fit, default=None)
 
     def _read(self, ref: BlobRef) -> bytes:
-        blobs = self._folder / BLOBS_NAME
-        # Ledgers have kept payloads in folders by their first digits, and without.
-        path = next((p for p in (blobs / ref.sha256, blobs / ref.sha256[:2] / ref.sha256) if p.is_file()), blobs)
         try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise PredictionError(f"no recorded depth {ref.sha256} in {blobs}: {error.strerror or error}") from error
+            content = stored_blob(self._folder, ref.sha256)
+        except (LedgerError, RequestRefusedError) as error:
+            raise PredictionError(f"no recorded depth: {error}") from error
         if hashlib.sha256(content).hexdigest() != ref.sha256:
-            raise PredictionError(f"the recorded depth {path} is damaged")
+            raise PredictionError(f"the recorded depth {ref.sha256} in {self._folder} is damaged")
         return content
 
 

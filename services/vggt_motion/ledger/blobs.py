@@ -1,4 +1,4 @@
-"""Blobs as files named by their content: ``blobs/abcdef...``.
+"""Large blobs as files named by their content: ``blobs/abcdef...``. Small ones stand among the rows (:mod:`.log`).
 
 A blob is written under ``blobs/incoming``, forced to the disk, renamed to its name and its folder forced to the disk;
 only then does a row refer to it. So a name under ``blobs`` always stands for whole content, whatever was killed;
@@ -225,6 +225,14 @@ class BlobFiles:
         with contextlib.suppress(OSError):
             make_folder(self._damaged, self._files)
             self._files.rename(path, self._damaged / sha256)
+
+    def keep_damaged(self, sha256: str, data: bytes) -> None:
+        """Write a damaged content that was no file to ``damaged/`` as well."""
+        path = self._damaged / self._path(sha256).name
+        _LOGGER.error("blob %s is damaged; kept as %s", sha256, path)
+        with contextlib.suppress(OSError):
+            make_folder(self._damaged, self._files)
+            path.write_bytes(data)
 
     def _path(self, sha256: str) -> Path:
         # The name comes from outside: it must never lead out of the folder.

@@ -11,9 +11,9 @@ from pathlib import Path
 from vggt_motion.errors import LedgerError
 from vggt_motion.ledger.blobs import BlobFiles
 from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, locked
-from vggt_motion.ledger.log import bounded_records, is_intact
+from vggt_motion.ledger.log import bounded_records, is_intact, set_content_aside
 from vggt_motion.ledger.sqlite import SqliteRows, integrity_problems, rebuild_indexes
-from vggt_motion.ledger.store import JobRow, Reader, RecordRow, Rows, Transaction, UnknownError
+from vggt_motion.ledger.store import JobRow, Reader, RecordRow, Rows, Transaction, UnknownError, sha256_hex
 from vggt_motion.records import JobState
 
 _PAGE = 256
@@ -77,7 +77,7 @@ def check(directory: Path, *, repair: bool = True) -> CheckReport:
         with findings.collecting_errors(), contextlib.closing(SqliteRows(path)) as rows:
             counts, referenced = _check_records(rows, findings)
             job_count = _check_jobs(rows, findings, repair=repair)
-            blob_count, blob_bytes = _check_blobs(directory, referenced, findings, repair=repair)
+            blob_count, blob_bytes = _check_blobs(directory, rows, referenced, findings, repair=repair)
             stored_bytes = rows.size_bytes() + blob_bytes
     return CheckReport(directory, counts, job_count, blob_count, stored_bytes, findings.repaired, findings.problems)
 
@@ -200,8 +200,9 @@ def _reopen(transaction: Transaction, job: JobRow) -> None:
 
 
 def _check_blobs(
-    directory: Path, referenced: dict[str, tuple[int, str]], findings: _Findings, *, repair: bool
+    directory: Path, rows: Rows, referenced: dict[str, tuple[int, str]], findings: _Findings, *, repair: bool
 ) -> tuple[int, int]:
+    """Number of sound blobs, and the bytes of those that are files."""
     blobs = BlobFiles(directory / BLOBS_NAME)
     orphans = [sha256 for sha256 in blobs.names() if sha256 not in referenced]
     # With damaged rows it is not known which blobs they refer to: then none is an orphan for certain.
@@ -212,6 +213,17 @@ def _check_blobs(
             blobs.remove(sha256)
     count = total_bytes = 0
     for sha256, (size_bytes, name) in sorted(referenced.items()):
+        content = rows.read(lambda reader, sha256=sha256: reader.find_content(sha256))  # type: ignore[misc]
+        if content is not None and sha256_hex(content) == sha256:
+            count += 1
+            continue
+        if content is not None:
+            if repair:
+                set_content_aside(rows, blobs, sha256, content)
+            findings.problem(
+                f"{name}: blob {sha256} is damaged (another content); appending the record again brings it back"
+            )
+            continue
         try:
             problem = blobs.problem(sha256, size_bytes)
         except UnknownError:

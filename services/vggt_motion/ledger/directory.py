@@ -1,8 +1,8 @@
 """One session's directory: the lock, the database and the blobs, opened and closed as one.
 
 DIR/session.lock   held exclusively by the process that serves the session
-DIR/ledger.db      rows (and ledger.db-wal, ledger.db-shm while it is open)
-DIR/blobs/         payloads by their hash
+DIR/ledger.db      rows and small payloads (and ledger.db-wal, ledger.db-shm while it is open)
+DIR/blobs/         large payloads by their hash
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Final
 from vggt_motion.errors import LedgerError
 from vggt_motion.ledger.blobs import BlobFiles, FileOperations, make_folder
 from vggt_motion.ledger.jobs import JobPolicy, JobQueue
-from vggt_motion.ledger.log import Store
-from vggt_motion.ledger.sqlite import SqliteRows
-from vggt_motion.ledger.store import NewRecord
+from vggt_motion.ledger.log import INLINE_BLOB_BYTES, Store
+from vggt_motion.ledger.sqlite import SqliteRows, read_only
+from vggt_motion.ledger.store import NewRecord, UnknownError
 from vggt_motion.records import JobReport
 
 DATABASE_NAME: Final = "ledger.db"
@@ -104,6 +104,7 @@ class Ledger:
         *,
         reserve_bytes: int = 0,
         input_streams: Collection[str] = (),
+        inline_blob_bytes: int = INLINE_BLOB_BYTES,
         policy: JobPolicy | None = None,
         result_streams: Mapping[str, str],
         dead_event: Callable[[JobReport], NewRecord],
@@ -119,6 +120,7 @@ class Ledger:
             directory: created if it is not there.
             reserve_bytes: see :class:`.log.Store`.
             input_streams: see :class:`.log.Store`.
+            inline_blob_bytes: see :class:`.log.Store`.
             policy: see :class:`.jobs.JobQueue`.
             result_streams: see :class:`.jobs.JobQueue`.
             dead_event: see :class:`.jobs.JobQueue`.
@@ -145,7 +147,12 @@ class Ledger:
             undo.callback(self.rows.close)
             files.sync_folder(directory)
             self.store = Store(
-                self.rows, self.blobs, reserve_bytes=reserve_bytes, input_streams=input_streams, time_ns=time_ns
+                self.rows,
+                self.blobs,
+                reserve_bytes=reserve_bytes,
+                input_streams=input_streams,
+                inline_blob_bytes=inline_blob_bytes,
+                time_ns=time_ns,
             )
             self.jobs = JobQueue(
                 self.rows,
@@ -162,3 +169,22 @@ class Ledger:
         """End waiting claims, close the database and give the lock back."""
         self.jobs.close()
         self._close.close()
+
+
+def stored_blob(directory: Path, sha256: str) -> bytes:
+    """The bytes of a blob of a session that another process may be serving; not verified.
+
+    Raises:
+        LedgerError: no ledger of ours, or it cannot be read.
+        UnknownError: it has no such blob.
+    """
+    with read_only(directory / DATABASE_NAME) as reader:
+        content = reader.find_content(sha256)
+    if content is not None:
+        return content
+    try:
+        return (directory / BLOBS_NAME / sha256).read_bytes()
+    except FileNotFoundError:
+        raise UnknownError(f"no blob {sha256} in {directory}") from None
+    except OSError as error:
+        raise LedgerError(f"cannot read blob {sha256} in {directory}: {error.strerror or error}") from error

@@ -1,4 +1,4 @@
-"""A session as one file, and back: a tar archive with the database and the blobs that its records refer to."""
+"""A session as one file, and back: a tar archive with the database and the blobs that are files beside it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vggt_motion.errors import InputError, LedgerError
 from vggt_motion.ledger.blobs import BlobFiles, FileOperations
 from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, locked
 from vggt_motion.ledger.sqlite import copy_database, read_only
-from vggt_motion.ledger.store import BlobEntry, sha256_hex
+from vggt_motion.ledger.store import BlobEntry, Reader, sha256_hex
 
 _MAX_BLOB_BYTES = 2**30
 
@@ -53,7 +53,8 @@ def export_session(directory: Path, archive: Path) -> ExportReport:
             tar.add(snapshot, DATABASE_NAME)
             with read_only(snapshot) as reader:
                 counts = dict(reader.positions())
-                entries = list(reader.blobs())
+                blob_count = _check_contents(reader)
+                entries = list(reader.file_blobs())
             # Blobs never change and are never removed while a record refers to them: no lock is needed.
             blobs = directory / BLOBS_NAME
             for entry in entries:
@@ -66,7 +67,7 @@ def export_session(directory: Path, archive: Path) -> ExportReport:
         raise InputError(f"cannot write {archive}: {error.strerror or error}") from error
     finally:
         partial.unlink(missing_ok=True)
-    return ExportReport(counts, len(entries), archive.stat().st_size)
+    return ExportReport(counts, blob_count + len(entries), archive.stat().st_size)
 
 
 def import_session(archive: Path, directory: Path) -> ExportReport:
@@ -118,12 +119,23 @@ def _import(archive: Path, directory: Path) -> ExportReport:
         raise InputError(f"cannot import {archive}: there is no {DATABASE_NAME} in it")
     with read_only(snapshot) as reader:
         counts = dict(reader.positions())
-        missing = set(reader.blobs()) - found
+        blob_count = _check_contents(reader)
+        missing = set(reader.file_blobs()) - found
     if missing:
         raise InputError(f"cannot import {archive}: {len(missing)} blobs are missing")
     FileOperations().rename(snapshot, directory / DATABASE_NAME)
     FileOperations().sync_folder(directory)
-    return ExportReport(counts, len(found), archive.stat().st_size)
+    return ExportReport(counts, blob_count + len(found), archive.stat().st_size)
+
+
+def _check_contents(reader: Reader) -> int:
+    """Verify the blobs among the rows; returns how many there are."""
+    count = 0
+    for sha256, content in reader.contents():
+        count += 1
+        if sha256_hex(content) != sha256:
+            raise LedgerError(f"blob {sha256} is damaged; run a check")
+    return count
 
 
 def _add(tar: tarfile.TarFile, entry: BlobEntry, path: Path) -> None:

@@ -234,7 +234,7 @@ class JobQueue:
         settled = self._rows.read(lambda reader: self._settled(reader, job_id, lease_id, record.stream))
         if settled is not None:
             return settled
-        entries = self._store.put_blobs(blobs, references, is_input=False)
+        prepared = self._store.prepare(blobs, references, is_input=False)
 
         def change(transaction: Transaction) -> Done:
             settled = self._settled(transaction, job_id, lease_id, record.stream)
@@ -245,7 +245,7 @@ class JobQueue:
             known = transaction.find_record(record.stream, job_id)
             if known is not None:
                 return Done(DoneOutcome.ALREADY_DONE, known.sequence)
-            return Done(DoneOutcome.COMMITTED, self._store.add(transaction, record, entries).sequence)
+            return Done(DoneOutcome.COMMITTED, self._store.add(transaction, record, prepared).sequence)
 
         return self._rows.write(change)
 

@@ -1,6 +1,7 @@
 """The durable log: streams of records with dense sequence numbers, appended idempotently, and the blobs they refer to.
 
-An append is acknowledged when its blobs and then its row have been forced to the disk. It may be repeated at will: the
+An append is acknowledged when its blobs and its row have been forced to the disk: small blobs with the row, in one
+commit; large ones before it, as files, for a database would write them twice. It may be repeated at will: the
 same identity under the same id is acknowledged again with the same sequence number, another identity is refused.
 """
 
@@ -18,6 +19,7 @@ from vggt_motion.ledger.store import (
     BlobEntry,
     Blobs,
     ConflictError,
+    DamagedBlobError,
     InvalidRequestError,
     NewRecord,
     Reader,
@@ -26,6 +28,7 @@ from vggt_motion.ledger.store import (
     Transaction,
     UnknownError,
     reserve_line,
+    sha256_hex,
 )
 
 MAX_RECORD_ID_BYTES = 256
@@ -35,6 +38,9 @@ MAX_BLOBS_PER_RECORD = 4096
 MAX_READ_RECORDS = 1000
 MAX_READ_BYTES = 8 * 2**20
 IDENTITY_BYTES = 32
+
+INLINE_BLOB_BYTES = 512 * 2**10
+"""Blobs up to this length are kept among the rows. Measured: 100 kB so takes half of the time of a file."""
 
 _STREAM = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _IDENTIFIER = re.compile(r"[!-~]+")
@@ -49,11 +55,22 @@ class Appended:
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """The blobs of a record that is about to be added."""
+
+    entries: tuple[BlobEntry, ...] = ()  # every blob that the record refers to
+    contents: tuple[Blob, ...] = ()  # those among them that are to be kept with the row
+
+
+_NOTHING = Prepared()
+
+
+@dataclass(frozen=True)
 class Sizes:
     """Bytes of a session on disk."""
 
-    row_bytes: int
-    blob_bytes: int
+    row_bytes: int  # with the small blobs
+    blob_bytes: int  # of the large ones
     free_bytes: int
 
 
@@ -67,6 +84,7 @@ class Store:
         *,
         reserve_bytes: int = 0,
         input_streams: Collection[str] = (),
+        inline_blob_bytes: int = INLINE_BLOB_BYTES,
         time_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Put the log's rules on top of rows and blobs.
@@ -76,12 +94,14 @@ class Store:
             blobs: durable blobs.
             reserve_bytes: free bytes below which new input is refused; everything else may use half of them.
             input_streams: the streams that bring new input, and with it more work and more data.
+            inline_blob_bytes: length up to which new blobs are kept among the rows.
             time_ns: wall clock, informative.
         """
         self._rows = rows
         self._blobs = blobs
         self.reserve_bytes = reserve_bytes
         self._input_streams = frozenset(input_streams)
+        self._inline_blob_bytes = inline_blob_bytes
         self._time_ns = time_ns
 
     def append(
@@ -106,35 +126,52 @@ class Store:
             known = self._rows.read(lambda reader: self._find_known(reader, record))
             if known is not None and self._has_all(known.stream, known.sequence):
                 return Appended(known.sequence, was_known=True)
-        entries = self.put_blobs(blobs, references, is_input=record.stream in self._input_streams)
-        return self._rows.write(lambda transaction: self.add(transaction, record, entries))
+        prepared = self.prepare(blobs, references, is_input=record.stream in self._input_streams)
+        return self._rows.write(lambda transaction: self.add(transaction, record, prepared))
 
-    def put_blobs(
-        self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool
-    ) -> list[BlobEntry]:
-        """Make the blobs of a record durable before its row; returns every blob that the record refers to."""
+    def prepare(self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> Prepared:
+        """Make the large blobs of a record durable, before its row, and see that every blob will be there.
+
+        Raises:
+            InvalidRequestError: too many.
+            UnknownError: a reference to a blob that is neither here nor stored.
+            DiskFullError: not enough space.
+        """
         if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
             raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")
         keep_free_bytes = self.reserve_bytes if is_input else self.reserve_bytes // 2
         free_bytes = self._blobs.free_bytes()
         if free_bytes < keep_free_bytes:
             raise DiskFullError(reserve_line(free_bytes, keep_free_bytes))
-        entries = self._blobs.put(blobs, keep_free_bytes=keep_free_bytes) if blobs else []
-        brought = {entry.sha256: entry.size_bytes for entry in entries}
+        hashed = [Blob.of(data) for data in blobs]
+        brought = {blob.entry.sha256: blob.entry.size_bytes for blob in hashed}
         for reference in references:
             if reference.sha256 in brought:
                 is_there = brought[reference.sha256] == reference.size_bytes
             else:
-                is_there = self._blobs.has(reference.sha256, reference.size_bytes)
+                is_there = self._has(reference)
             if not is_there:
                 raise UnknownError(
                     f"no blob {reference.sha256} of {reference.size_bytes} bytes, to which the record refers"
                 )
-        return sorted({*entries, *references}, key=lambda entry: entry.sha256)
+        small = {blob.entry.sha256: blob for blob in hashed if len(blob.data) <= self._inline_blob_bytes}
+        # The write-ahead log and the database hold each for a while.
+        small_bytes = 2 * sum(blob.entry.size_bytes for blob in small.values())
+        if free_bytes < small_bytes:
+            raise DiskFullError(f"the ledger's disk has no space for {small_bytes} bytes: {free_bytes} are left")
+        large = [blob for blob in hashed if blob.entry.sha256 not in small]
+        if large:
+            self._blobs.put(large, keep_free_bytes=keep_free_bytes)
+        entries = sorted({*(blob.entry for blob in hashed), *references}, key=lambda entry: entry.sha256)
+        return Prepared(tuple(entries), tuple(small.values()))
 
-    def add(self, transaction: Transaction, record: NewRecord, blobs: Sequence[BlobEntry] = ()) -> Appended:
-        """Append within a larger change; the record must be checked and its blobs durable already."""
+    def add(self, transaction: Transaction, record: NewRecord, prepared: Prepared = _NOTHING) -> Appended:
+        """Append within a larger change; the record must be checked and its blobs prepared already."""
         known = self._find_known(transaction, record)
+        for blob in prepared.contents:
+            # Also of a known record: a content that was damaged comes back so.
+            if transaction.find_content(blob.entry.sha256) != blob.data:
+                transaction.set_content(blob.entry.sha256, blob.data)
         if known is not None:
             return Appended(known.sequence, was_known=True)
         sequence = transaction.next_sequence(record.stream)
@@ -149,7 +186,7 @@ class Store:
             append_time_ns=time_ns,
             row_sha256=row_digest(record, sequence, time_ns),
         )
-        transaction.add_record(row, blobs)
+        transaction.add_record(row, prepared.entries)
         return Appended(sequence, was_known=False)
 
     def read(self, stream: str, from_sequence: int = 0, limit: int = 0) -> list[RecordRow]:
@@ -170,8 +207,20 @@ class Store:
         return self._rows.read(lambda reader: list(bounded_records(reader, stream, from_sequence, count)))
 
     def blob(self, sha256: str) -> bytes:
-        """The bytes of a blob, verified; see :meth:`.store.Blobs.get`."""
-        return self._blobs.get(sha256)
+        """The bytes of a blob, verified; damaged ones are set aside, and appending the record again heals them.
+
+        Raises:
+            InvalidRequestError: not a SHA-256.
+            UnknownError: there is no such blob.
+            DamagedBlobError: its bytes are not what they were.
+        """
+        content = self._rows.read(lambda reader: reader.find_content(sha256))
+        if content is None:
+            return self._blobs.get(sha256)
+        if sha256_hex(content) != sha256:
+            set_content_aside(self._rows, self._blobs, sha256, content)
+            raise DamagedBlobError(f"blob {sha256} is damaged: {len(content)} bytes with another hash")
+        return content
 
     def positions(self) -> dict[str, int]:
         """Next sequence number of every stream that has records."""
@@ -179,7 +228,7 @@ class Store:
 
     def sizes(self) -> Sizes:
         """Bytes on disk."""
-        blob_bytes = self._rows.read(lambda reader: reader.blob_bytes())
+        blob_bytes = self._rows.read(lambda reader: reader.file_blob_bytes())
         return Sizes(self._rows.size_bytes(), blob_bytes, self._blobs.free_bytes())
 
     @property
@@ -198,7 +247,17 @@ class Store:
     def _has_all(self, stream: str, sequence: int) -> bool:
         # A blob that was damaged and set aside comes back with a repeated append.
         entries = self._rows.read(lambda reader: reader.record_blobs(stream, sequence))
-        return all(self._blobs.has(entry.sha256, entry.size_bytes) for entry in entries)
+        return all(self._has(entry) for entry in entries)
+
+    def _has(self, entry: BlobEntry) -> bool:
+        is_row = self._rows.read(lambda reader: reader.has_content(entry.sha256, entry.size_bytes))
+        return is_row or self._blobs.has(entry.sha256, entry.size_bytes)
+
+
+def set_content_aside(rows: Rows, blobs: Blobs, sha256: str, content: bytes) -> None:
+    """Take a damaged content out of the rows."""
+    blobs.keep_damaged(sha256, content)
+    rows.write(lambda transaction: transaction.remove_content(sha256))
 
 
 def bounded_records(reader: Reader, stream: str, from_sequence: int, count: int) -> Sequence[RecordRow]:

@@ -60,5 +60,10 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         )""",
         "CREATE INDEX leases_by_claim ON leases (worker, claim_id)",
     ),
+    (
+        # Small blobs stand beside the rows that brought them: one commit for both. What was a file stays one.
+        "CREATE TABLE contents (sha256 TEXT NOT NULL PRIMARY KEY, content BLOB NOT NULL)",
+        "ALTER TABLE blobs ADD COLUMN is_file INTEGER NOT NULL DEFAULT 1",
+    ),
 )
 SCHEMA_VERSION = len(MIGRATIONS)

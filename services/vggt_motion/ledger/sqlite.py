@@ -60,12 +60,25 @@ class _Statements:
             WHERE stream = ? AND sequence = ? ORDER BY blobs.sha256"""
         return [BlobEntry(*row) for row in self._all(statement, stream, sequence)]
 
-    def blobs(self) -> Iterable[BlobEntry]:
-        for row in self._connection.execute("SELECT sha256, size_bytes FROM blobs ORDER BY sha256"):
+    def file_blobs(self) -> Iterable[BlobEntry]:
+        statement = "SELECT sha256, size_bytes FROM blobs WHERE is_file <> 0 ORDER BY sha256"
+        for row in self._connection.execute(statement):
             yield BlobEntry(*row)
 
-    def blob_bytes(self) -> int:
-        return int(self._value("SELECT COALESCE(SUM(size_bytes), 0) FROM blobs"))
+    def file_blob_bytes(self) -> int:
+        return int(self._value("SELECT COALESCE(SUM(size_bytes), 0) FROM blobs WHERE is_file <> 0"))
+
+    def find_content(self, sha256: str) -> bytes | None:
+        row = self._one("SELECT content FROM contents WHERE sha256 = ?", sha256)
+        return None if row is None else bytes(row[0])
+
+    def has_content(self, sha256: str, size_bytes: int) -> bool:
+        row = self._one("SELECT LENGTH(content) FROM contents WHERE sha256 = ?", sha256)
+        return row is not None and row[0] == size_bytes
+
+    def contents(self) -> Iterable[tuple[str, bytes]]:
+        for sha256, content in self._connection.execute("SELECT sha256, content FROM contents ORDER BY sha256"):
+            yield str(sha256), bytes(content)
 
     def find_meta(self, key: str) -> str | None:
         row = self._one("SELECT value FROM meta WHERE key = ?", key)
@@ -133,9 +146,10 @@ class _Statements:
         self._run(f"INSERT INTO records ({_RECORD_COLUMNS}) VALUES ({_marks(values)})", *values)
         for blob in sorted(set(blobs), key=lambda blob: blob.sha256):
             self._run(
-                "INSERT INTO blobs (sha256, size_bytes) VALUES (?, ?) ON CONFLICT (sha256) DO NOTHING",
+                "INSERT INTO blobs (sha256, size_bytes, is_file) VALUES (?, ?, ?) ON CONFLICT (sha256) DO NOTHING",
                 blob.sha256,
                 blob.size_bytes,
+                not self.has_content(blob.sha256, blob.size_bytes),
             )
             self._run(
                 "INSERT INTO record_blobs (stream, sequence, sha256) VALUES (?, ?, ?)",
@@ -143,6 +157,18 @@ class _Statements:
                 row.sequence,
                 blob.sha256,
             )
+
+    def set_content(self, sha256: str, content: bytes) -> None:
+        self._run(
+            """INSERT INTO contents (sha256, content) VALUES (?, ?)
+            ON CONFLICT (sha256) DO UPDATE SET content = excluded.content""",
+            sha256,
+            content,
+        )
+        self._run("UPDATE blobs SET is_file = 0 WHERE sha256 = ?", sha256)
+
+    def remove_content(self, sha256: str) -> None:
+        self._run("DELETE FROM contents WHERE sha256 = ?", sha256)
 
     def set_meta(self, key: str, value: str) -> None:
         self._run(
@@ -365,7 +391,7 @@ def connect(path: Path, *, is_read_only: bool = False) -> sqlite3.Connection:
 
 @contextlib.contextmanager
 def read_only(path: Path) -> Iterator[Reader]:
-    """Committed rows of a database that another process may be serving.
+    """Committed rows of a database that another process may be serving; an older one is brought up to date first.
 
     Raises:
         LedgerError: no database of ours, or damaged.
@@ -374,7 +400,11 @@ def read_only(path: Path) -> Iterator[Reader]:
         if not path.is_file():
             raise LedgerError(f"{path.parent} holds no ledger")
         with contextlib.closing(connect(path, is_read_only=True)) as connection:
-            _check_version(_version(connection), path)
+            version = _version(connection)
+            _check_version(version, path)
+            if version < SCHEMA_VERSION:
+                with contextlib.closing(connect(path)) as writer:
+                    _migrate(writer, path)
             connection.execute("BEGIN")
             yield _Statements(connection)
 

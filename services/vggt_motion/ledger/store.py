@@ -143,11 +143,20 @@ class Reader(Protocol):
     def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
         """The blobs that a record refers to."""
 
-    def blobs(self) -> Iterable[BlobEntry]:
-        """All blobs in order of their hash, as long as the query lasts."""
+    def file_blobs(self) -> Iterable[BlobEntry]:
+        """The blobs whose content is not among the rows, in order of their hash, as long as the query lasts."""
 
-    def blob_bytes(self) -> int:
-        """Sum of the sizes of all blobs, each counted once."""
+    def file_blob_bytes(self) -> int:
+        """Sum of their sizes, each counted once."""
+
+    def find_content(self, sha256: str) -> bytes | None:
+        """The content of a blob that is kept among the rows; not verified."""
+
+    def has_content(self, sha256: str, size_bytes: int) -> bool:
+        """Whether it is there with this size."""
+
+    def contents(self) -> Iterable[tuple[str, bytes]]:
+        """All contents among the rows with the hashes they are kept under, as long as the query lasts."""
 
     def find_meta(self, key: str) -> str | None:
         """A fact about the session."""
@@ -188,7 +197,13 @@ class Transaction(Reader, Protocol):
         """The next sequence number of a stream, taken: it is used up if and only if the change commits."""
 
     def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
-        """Insert a record and its references to blobs."""
+        """Insert a record and its references to blobs, whose contents are there already, among the rows or not."""
+
+    def set_content(self, sha256: str, content: bytes) -> None:
+        """Insert or replace the content of a blob."""
+
+    def remove_content(self, sha256: str) -> None:
+        """Delete the content of a blob."""
 
     def set_meta(self, key: str, value: str) -> None:
         """Insert or replace a fact about the session."""
@@ -234,7 +249,7 @@ class Rows(Protocol):
 
 
 class Blobs(Protocol):
-    """Durable bytes, addressed by their SHA-256."""
+    """Durable bytes, addressed by their SHA-256: those that are too large to stand among the rows."""
 
     def put(self, blobs: Sequence[bytes | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
         """Make blobs durable, in order; durable on return. Known ones are not stored twice.
@@ -256,6 +271,9 @@ class Blobs(Protocol):
 
     def free_bytes(self) -> int:
         """Space left for more."""
+
+    def keep_damaged(self, sha256: str, data: bytes) -> None:
+        """Keep a content that is not what it was where a person can look at it."""
 
 
 def sha256_hex(data: bytes) -> str:

@@ -19,6 +19,7 @@ from cutting_proxy import CuttingProxy
 from fault_run import FaultRun, Outcome, Snapshot, free_port, moments
 from test_fault_cross_section import SERVICES
 
+from ledger_helpers import damage_blob
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.jobs import JobClient
 from vggt_motion.bus.ledger import LedgerClient, append_request
@@ -394,8 +395,7 @@ def test_a_poison_submap_is_halved(start: Start, fault_sample: Path, small_refer
     copy = folder.parent / "poisoned"
     shutil.copytree(folder / "ledger", copy)
     for frame in victim.frames:
-        for path in (copy / "blobs").rglob(frame.depth.sha256):
-            path.write_bytes(b"poison")
+        damage_blob(copy, frame.depth.sha256, b"poison")
     run = start(f"inference.recorded.ledger={copy}", "ledger.retry_backoff_s=0.05", seconds_per_submap=0.0)
     outcome = run.finish()
     assert outcome.exit_code == 0, outcome.output

@@ -16,6 +16,7 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ledger_helpers import stored_blobs
 from live_session import live_session, wait_for
 from synthetic_session import Session
 from vggt_motion.bus import calls, codec
@@ -160,7 +161,7 @@ def test_hostile_bytes_through_a_live_session(tmp_path: Path, sample_dir: Path, 
             camera.put(encode_image(frame, "front"), attachment=ImageHeader(0, frame.index).encode())
         wait_for(lambda: session.ledger.status().position("keyframe") > 1, "keyframes")
         time.sleep(1.0)
-        before, stored = session.ledger.status(), _stored(tmp_path)
+        before, stored = session.ledger.status(), stored_blobs(tmp_path / "ledger")
         # Valid in form, but not in content: a bomb, a wrong shape, no number, an unknown stream.
         submap = SESSION.submaps[0]
         bomb = codec.blob_ref(_bomb(), codec.DEPTH_MEDIA_TYPE)
@@ -194,7 +195,7 @@ def test_hostile_bytes_through_a_live_session(tmp_path: Path, sample_dir: Path, 
             camera.put(payload, attachment=generator.choice([b"", b"\xff" * 9, ImageHeader(0, 11).encode()]))
         status = wait_for(lambda: _settled(session, before.refused_request_count + refused), "the refusals' count")
         assert status.positions == before.positions and status.job_counts == before.job_counts
-        assert _stored(tmp_path) == stored
+        assert stored_blobs(tmp_path / "ledger") == stored
         for frame in images[10:]:
             camera.put(encode_image(frame, "front"), attachment=ImageHeader(1, frame.index).encode())
         wait_for(lambda: session.ledger.status().position("keyframe") > before.position("keyframe"), "more keyframes")
@@ -212,10 +213,6 @@ def test_hostile_bytes_through_a_live_session(tmp_path: Path, sample_dir: Path, 
 def _refused_frames(report: HealthReport | None) -> float:
     counters = {} if report is None else report.counters
     return counters.get("refused_frames", 0.0) + counters.get("unreadable_frames", 0.0)
-
-
-def _stored(folder: Path) -> set[str]:
-    return {path.name for path in (folder / "ledger" / "blobs").rglob("*") if path.is_file()}
 
 
 def _is_sound(entry: str, payload: bytes) -> bool:
