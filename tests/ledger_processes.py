@@ -64,11 +64,11 @@ def depth_blob(seed: int, width: int = 40, height: int = 30) -> bytes:
     return codec.encode_depth(depth, random.uniform(0.0, 1.0, (height, width)).astype(np.float32))
 
 
-def submap(index: int, depth: bytes, seconds: float = 1.0) -> SubmapGeometry:
+def submap(index: int, depth: bytes, seconds: float = 1.0, *, shape: tuple[int, int] = (40, 30)) -> SubmapGeometry:
     """A result of a predict job: the same content for the same index, but for the time that it took."""
     name = f"front/0/{index:08d}"
     ref = BlobRef(codec.blob_ref(depth, codec.DEPTH_MEDIA_TYPE).sha256, len(depth), codec.DEPTH_MEDIA_TYPE)
-    intrinsics = Intrinsics(fx=30.0, fy=30.0, cx=20.0, cy=15.0, width_px=40, height_px=30)
+    intrinsics = Intrinsics(fx=30.0, fy=30.0, cx=20.0, cy=15.0, width_px=shape[0], height_px=shape[1])
     return SubmapGeometry(
         spec=SubmapSpec(index, 1, (), (name,)),
         verdict=SubmapVerdict.GOOD,

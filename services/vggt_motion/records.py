@@ -459,6 +459,7 @@ class LedgerStatus:
     is_accepting: bool  # False below the reserve of free disk
     detail: str  # one line for a person; empty when all is well
     refused_request_count: int  # since the ledger started
+    ledger_id: str  # of this log, also of none that stood under the same session before; empty from an older ledger
 
     def position(self, stream: str) -> int:
         """Number of records of a stream; 0 for one that has none."""

@@ -150,7 +150,7 @@ def test_blobs_are_verified(bus: Bus, fake: FakeLedger) -> None:
 
 
 def test_status(bus: Bus, fake: FakeLedger) -> None:
-    status = LedgerStatus((StreamPosition("event", 4),), (), 10, 20, True, "", 0)
+    status = LedgerStatus((StreamPosition("event", 4),), (), 10, 20, True, "", 0, "0a1b")
     fake.on("ledger", "status", calls.StatusRequest, lambda _: status)
     got = LedgerClient(bus).status()
     assert got == status

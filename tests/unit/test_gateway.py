@@ -59,7 +59,7 @@ def ledger_status(session: Session, **changes: Any) -> LedgerStatus:
         counts[stream.value] = sequence + 1
     positions = tuple(StreamPosition(stream, count) for stream, count in counts.items())
     jobs = (JobCount("predict", "open", 2), JobCount("predict", "done", 3), JobCount("register", "leased", 1))
-    return replace(LedgerStatus(positions, jobs, 1000, 2000, True, "", 4), **changes)
+    return replace(LedgerStatus(positions, jobs, 1000, 2000, True, "", 4, "0a1b"), **changes)
 
 
 def client_of(state: GatewayState, config: GatewayConfig = LOCAL, **options: Any) -> TestClient:

@@ -290,6 +290,22 @@ def test_a_small_blob_and_its_record_share_one_commit(tmp_path: Path) -> None:
     ledger.close()
 
 
+def test_of_many_at_a_time_those_that_come_late_are_files(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+    Gate(ledger.rows, waiting=15)
+    contents = [b"%d" % index for index in range(16)]
+    in_threads(
+        16,
+        lambda index: ledger.store.append(record("keyframe", f"{index}"), [contents[index]], [entry(contents[index])]),
+    )
+    names = {path.name for path in (tmp_path / "session" / "blobs").glob("*[0-9a-f]")}
+    assert 0 < len(names) < 16
+    assert [ledger.store.blob(entry(content).sha256) for content in contents] == contents
+    ledger.close()
+    report = check(tmp_path / "session")
+    assert report.is_sound and report.blob_count == 16 and report.repaired == ()
+
+
 def test_a_refused_record_leaves_no_content_behind(tmp_path: Path) -> None:
     ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
     ledger.store.append(record("keyframe", "a"))

@@ -23,9 +23,11 @@ from vggt_motion.bus.images import ImageHeader, encode_image
 from vggt_motion.bus.jobs import one_line
 from vggt_motion.bus.ledger import append_request
 from vggt_motion.bus.pubsub import Publisher
+from vggt_motion.bus.retry import retry
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.config import Config
 from vggt_motion.errors import (
+    BusError,
     BusUnavailableError,
     DiskFullError,
     InputError,
@@ -56,6 +58,7 @@ _DISK_RETRY_S = 1.0
 _SPOOL_POLL_S = 0.5
 _SILENT_S = 2.0  # a live camera without a frame for so long has stalled, and the status says so
 _RATE_FRAMES = 32  # frames over which the rate is measured that turns a delay in frames into seconds
+_WARNING_PATIENCE_S = 10.0
 
 
 def main(
@@ -349,10 +352,19 @@ class _Outbox:
 
     def __init__(self, context: ServiceContext, camera: str) -> None:
         self._context = context
-        folder = context.config.spool.directory or Path.home() / ".vggt-motion" / "spool"
-        self._spool = Spool(folder / context.config.bus.session / camera, context.config.spool.max_bytes)
+        root = context.config.spool.directory or Path.home() / ".vggt-motion" / "spool"
+        patience_s = context.config.bus.connect_timeout_s
+        status = retry(context.bus, context.ledger.status, patience_s=patience_s, what="the ledger's status")
+        # What waits for one ledger is nothing to another that stands under the same session.
+        folder = root / context.config.bus.session / camera
+        for other in sorted(folder.glob("*/*.request")):
+            if other.parent.name != status.ledger_id:
+                _log.warning("records for another ledger are left waiting", extra={"folder": str(other.parent)})
+                break
+        self._spool = Spool(folder / (status.ledger_id or "unknown"), context.config.spool.max_bytes)
         self._failure: VggtMotionError | None = None
         self._full_count = 0
+        self._refused_count = 0
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
@@ -361,6 +373,7 @@ class _Outbox:
             "spooled_records": self._spool.count,
             "spooled_bytes": self._spool.size_bytes,
             "spool_full_waits": self._full_count,
+            "refused_records": self._refused_count,
         }
 
     def put(self, request: bytes) -> None:
@@ -398,9 +411,29 @@ class _Outbox:
                 self._context.stopping.wait(_DISK_RETRY_S)
             except BusUnavailableError:
                 return  # told to stop
+            except RequestRefusedError as error:
+                if error.code is RefusalCode.INTERNAL:  # a defect over there: it may pass, the record is kept
+                    self._context.set_health("waiting", str(error), **self.counters())
+                    self._context.stopping.wait(_DISK_RETRY_S)
+                else:
+                    self._set_aside(error)
             except VggtMotionError as error:
                 self._failure = error
                 return
+
+    def _set_aside(self, error: RequestRefusedError) -> None:
+        """Keep what is refused for good, tell of it in the log, and go on: it must not hold up what comes after it."""
+        try:
+            kept = self._spool.set_first_aside()
+        except InputError as problem:
+            self._failure = problem
+            return
+        self._refused_count += 1
+        reason = one_line(f"a record of the camera was refused: {error}")
+        _log.error("a record was refused and set aside", extra={"kept": str(kept), "reason": str(error)})
+        event = Event(f"record_refused/{kept.stem}", EventKind.WARNING, reason, time.time_ns(), {"kept": str(kept)})
+        with contextlib.suppress(BusError, DiskFullError):
+            self._context.ledger.append(Stream.EVENT, event.event_id, event, patience_s=_WARNING_PATIENCE_S)
 
 
 @contextlib.contextmanager

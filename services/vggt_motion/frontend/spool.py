@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from pathlib import Path
 
 from vggt_motion.errors import InputError
@@ -84,6 +85,21 @@ class Spool:
             self._path(number).unlink(missing_ok=True)
             del self._sizes[number]
             self._changed.notify_all()
+
+    def set_first_aside(self) -> Path:
+        """The oldest request can never be acknowledged: keep it in ``refused/``, where a person can look at it."""
+        with self._changed:
+            number = min(self._sizes)
+            folder = self._folder / "refused"
+            target = folder / f"{time.time_ns()}{_SUFFIX}"
+            try:
+                folder.mkdir(exist_ok=True)
+                self._path(number).replace(target)
+            except OSError as error:
+                raise InputError(f"cannot write to the spool {folder}: {error.strerror or error}") from error
+            del self._sizes[number]
+            self._changed.notify_all()
+            return target
 
     def wait_until_empty(self, timeout_s: float) -> bool:
         """Whether nothing waits any more."""

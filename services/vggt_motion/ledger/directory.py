@@ -11,6 +11,7 @@ import contextlib
 import fcntl
 import os
 import time
+import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Final
@@ -20,12 +21,13 @@ from vggt_motion.ledger.blobs import BlobFiles, FileOperations, make_folder
 from vggt_motion.ledger.jobs import JobPolicy, JobQueue
 from vggt_motion.ledger.log import INLINE_BLOB_BYTES, Store
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
-from vggt_motion.ledger.store import NewRecord, UnknownError
+from vggt_motion.ledger.store import NewRecord, Transaction, UnknownError
 from vggt_motion.records import JobReport
 
 DATABASE_NAME: Final = "ledger.db"
 LOCK_NAME: Final = "session.lock"
 BLOBS_NAME: Final = "blobs"
+_LEDGER_ID = "ledger_id"
 _PATIENCE_S = 0.5
 
 
@@ -163,12 +165,22 @@ class Ledger:
                 clock=clock,
                 new_lease_id=new_lease_id,
             )
+            self.ledger_id = self.rows.write(_identified)
             self._close = undo.pop_all()
 
     def close(self) -> None:
         """End waiting claims, close the database and give the lock back."""
         self.jobs.close()
         self._close.close()
+
+
+def _identified(transaction: Transaction) -> str:
+    """An id that no other log has, made when this one was."""
+    known = transaction.find_meta(_LEDGER_ID)
+    if known is None:
+        known = uuid.uuid4().hex
+        transaction.set_meta(_LEDGER_ID, known)
+    return known
 
 
 def stored_blob(directory: Path, sha256: str) -> bytes:

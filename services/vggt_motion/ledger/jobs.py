@@ -234,7 +234,6 @@ class JobQueue:
         settled = self._rows.read(lambda reader: self._settled(reader, job_id, lease_id, record.stream))
         if settled is not None:
             return settled
-        prepared = self._store.prepare(blobs, references, is_input=False)
 
         def change(transaction: Transaction) -> Done:
             settled = self._settled(transaction, job_id, lease_id, record.stream)
@@ -247,7 +246,9 @@ class JobQueue:
                 return Done(DoneOutcome.ALREADY_DONE, known.sequence)
             return Done(DoneOutcome.COMMITTED, self._store.add(transaction, record, prepared).sequence)
 
-        return self._rows.write(change)
+        with self._store.bringing(blobs):
+            prepared = self._store.prepare(blobs, references, is_input=False)
+            return self._rows.write(change)
 
     def fail(self, job_id: str, lease_id: str, reason: str, traceback: str = "", *, is_permanent: bool = False) -> bool:
         """Give a job back after an error; until ``max_failures`` it is tried again, after a back-off that doubles.

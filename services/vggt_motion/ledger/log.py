@@ -7,10 +7,12 @@ same identity under the same id is acknowledged again with the same sequence num
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
+import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from vggt_motion.errors import DiskFullError
@@ -40,7 +42,13 @@ MAX_READ_BYTES = 8 * 2**20
 IDENTITY_BYTES = 32
 
 INLINE_BLOB_BYTES = 512 * 2**10
-"""Blobs up to this length are kept among the rows. Measured: 100 kB so takes half of the time of a file."""
+"""Blobs up to this length are kept among the rows while few come at a time.
+
+Measured at 100 kB: one after the other, a record with its blob among the rows takes a third of the time of one with a
+file (one sync in place of three); of 64 at a time, 1.7 times as many are stored with files, which share their syncs and
+are written once, not twice.
+"""
+_FEW_AT_A_TIME = 4
 
 _STREAM = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _IDENTIFIER = re.compile(r"[!-~]+")
@@ -102,6 +110,8 @@ class Store:
         self.reserve_bytes = reserve_bytes
         self._input_streams = frozenset(input_streams)
         self._inline_blob_bytes = inline_blob_bytes
+        self._lock = threading.Lock()
+        self._preparing_count = 0  # records with blobs that are on their way to the disk
         self._time_ns = time_ns
 
     def append(
@@ -126,8 +136,21 @@ class Store:
             known = self._rows.read(lambda reader: self._find_known(reader, record))
             if known is not None and self._has_all(known.stream, known.sequence):
                 return Appended(known.sequence, was_known=True)
-        prepared = self.prepare(blobs, references, is_input=record.stream in self._input_streams)
-        return self._rows.write(lambda transaction: self.add(transaction, record, prepared))
+        with self.bringing(blobs):
+            prepared = self.prepare(blobs, references, is_input=record.stream in self._input_streams)
+            return self._rows.write(lambda transaction: self.add(transaction, record, prepared))
+
+    @contextlib.contextmanager
+    def bringing(self, blobs: Sequence[bytes | Blob]) -> Iterator[None]:
+        """Count a record as under way while its blobs and its row are stored: many at a time are stored otherwise."""
+        count = 1 if blobs else 0
+        with self._lock:
+            self._preparing_count += count
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._preparing_count -= count
 
     def prepare(self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> Prepared:
         """Make the large blobs of a record durable, before its row, and see that every blob will be there.
@@ -154,7 +177,8 @@ class Store:
                 raise UnknownError(
                     f"no blob {reference.sha256} of {reference.size_bytes} bytes, to which the record refers"
                 )
-        small = {blob.entry.sha256: blob for blob in hashed if len(blob.data) <= self._inline_blob_bytes}
+        limit_bytes = self._inline_blob_bytes if self._preparing_count <= _FEW_AT_A_TIME else -1
+        small = {blob.entry.sha256: blob for blob in hashed if len(blob.data) <= limit_bytes}
         # The write-ahead log and the database hold each for a while.
         small_bytes = 2 * sum(blob.entry.size_bytes for blob in small.values())
         if free_bytes < small_bytes:

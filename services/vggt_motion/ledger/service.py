@@ -56,7 +56,7 @@ _TICK_S = 0.25
 _HEALTH_S = 1.0
 _SIZES_S = 5.0  # the sum over all blobs is not asked for more often
 _HISTORY = 16
-_GATHER_S = 0.002  # acknowledgements go out first, and what comes together is read from the log together
+_GATHER_S = 0.01  # acknowledgements go out first, and what comes together is read from the log together
 _FEW_WAITERS = 32
 _CROWDED_WAIT_S = 1.0
 _VANISHED_GRACE_S = 0.2
@@ -367,6 +367,7 @@ class Desk:
             is_accepting=free_bytes >= store.reserve_bytes,
             detail="" if free_bytes >= store.reserve_bytes else reserve_line(free_bytes, store.reserve_bytes),
             refused_request_count=self._refused_count,
+            ledger_id=self._ledger.ledger_id,
         )
 
     def submit(self, payload: bytes) -> bytes:

@@ -131,7 +131,7 @@ class JobCount(_message.Message):
     def __init__(self, kind: _Optional[str] = ..., state: _Optional[str] = ..., count: _Optional[int] = ...) -> None: ...
 
 class LedgerStatus(_message.Message):
-    __slots__ = ("schema_version", "positions", "job_counts", "stored_bytes", "free_bytes", "is_accepting", "detail", "refused_request_count")
+    __slots__ = ("schema_version", "positions", "job_counts", "stored_bytes", "free_bytes", "is_accepting", "detail", "refused_request_count", "ledger_id")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     POSITIONS_FIELD_NUMBER: _ClassVar[int]
     JOB_COUNTS_FIELD_NUMBER: _ClassVar[int]
@@ -140,6 +140,7 @@ class LedgerStatus(_message.Message):
     IS_ACCEPTING_FIELD_NUMBER: _ClassVar[int]
     DETAIL_FIELD_NUMBER: _ClassVar[int]
     REFUSED_REQUEST_COUNT_FIELD_NUMBER: _ClassVar[int]
+    LEDGER_ID_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     positions: _containers.RepeatedCompositeFieldContainer[StreamPosition]
     job_counts: _containers.RepeatedCompositeFieldContainer[JobCount]
@@ -148,4 +149,5 @@ class LedgerStatus(_message.Message):
     is_accepting: bool
     detail: str
     refused_request_count: int
-    def __init__(self, schema_version: _Optional[int] = ..., positions: _Optional[_Iterable[_Union[StreamPosition, _Mapping]]] = ..., job_counts: _Optional[_Iterable[_Union[JobCount, _Mapping]]] = ..., stored_bytes: _Optional[int] = ..., free_bytes: _Optional[int] = ..., is_accepting: bool = ..., detail: _Optional[str] = ..., refused_request_count: _Optional[int] = ...) -> None: ...
+    ledger_id: str
+    def __init__(self, schema_version: _Optional[int] = ..., positions: _Optional[_Iterable[_Union[StreamPosition, _Mapping]]] = ..., job_counts: _Optional[_Iterable[_Union[JobCount, _Mapping]]] = ..., stored_bytes: _Optional[int] = ..., free_bytes: _Optional[int] = ..., is_accepting: bool = ..., detail: _Optional[str] = ..., refused_request_count: _Optional[int] = ..., ledger_id: _Optional[str] = ...) -> None: ...

@@ -101,6 +101,7 @@ _LEDGER_STATUS = plan(
         "is_accepting": Flag(),
         "detail": LINE,
         "refused_request_count": INDEX,
+        "ledger_id": Text(64, 0, re.compile("[0-9a-f]*"), "hexadecimal digits"),
     },
 )
 _APPEND_REQUEST = plan(

@@ -1,30 +1,40 @@
-"""What durability costs: append, claim/done and follow beside the bare limits, measured in the same run.
+"""What the fabric costs: append, claim/done and follow beside the bare limits, and its share of a run's CPU seconds.
 
-    python tests/benchmarks/bench_ledger.py [--directory DIR] [--seconds S] [--json FILE]
+    python tests/benchmarks/bench_fabric.py [--directory DIR] [--seconds S] [--source SOURCE] [--json FILE]
 
 Three processes on loopback: router, ledger, client. The bare limits are: write and fsync of the same bytes to a new
 file; the same bytes over Zenoh through the router to a process that answers with one byte (one hop); their SHA-256.
 The folder must be on a real disk: in memory an fsync costs nothing. A round measures everything for a moment, and the
 rounds are repeated, so that a disk that has a bad minute has it for all.
+
+Then one ``vggt-motion run`` of a source, whose processes are watched. Numerics are the computing children, the pixels
+in the frontend (what the pure pipeline needs for the same frames in this process) and the results that ``run`` writes
+after the final graph; everything else after start-up is fabric. Start-up is what a process used before the frontend was
+started, and for the frontend what it used before its first record.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import json
 import os
 import random
+import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import median
 
+import cv2
+import psutil
 import zenoh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -38,13 +48,20 @@ from vggt_motion.bus.ledger import append_request
 from vggt_motion.bus.service import run_service
 from vggt_motion.bus.session import zenoh_config
 from vggt_motion.config import Config, LedgerConfig
+from vggt_motion.errors import LedgerError
+from vggt_motion.frontend.pipeline import FrontendPipeline
 from vggt_motion.ledger.admission import admitted
 from vggt_motion.ledger.service import open_session
+from vggt_motion.ledger.sqlite import read_only
 from vggt_motion.records import Event, JobKind, Keyframe, SubmapSpec
+from vggt_motion.sources.registry import open_source
 
 SIZES_BYTES = (100, 100_000, 5_000_000)
 IN_FLIGHT = 64
+JOBS = 100
+FOLLOWED = 100
 ROUNDS = 3
+SAMPLE = Path(__file__).resolve().parents[1] / "data" / "kitti_06_first51"
 MIN_COUNT = 3
 BYTES_PER_ROUND = 400_000_000  # a round of large records ends early rather than fill the disk
 
@@ -152,13 +169,13 @@ class Bench:
         request = append_request(*source.record())
         self.store.store.append(*admitted(request))
 
-    def claim_and_done(self) -> None:
+    def claim_and_done(self, depths: Mapping[int, bytes], shape: tuple[int, int]) -> None:
         """One job: leased, and its result with one blob committed."""
         lease = self.jobs.claim([JobKind.PREDICT], [], "inference/bench", 1.0)
         assert lease is not None
         index = codec.decode(SubmapSpec, lease.job.payload).submap_index
-        depth = depth_blob(index)
-        assert self.jobs.done(lease, "submap", lease.job.job_id, submap(index, depth), [depth])
+        depth = depths[index]
+        assert self.jobs.done(lease, "submap", lease.job.job_id, submap(index, depth, shape=shape), [depth])
 
 
 def measure(bench: Bench, size_bytes: int, seconds: float) -> dict[str, float]:
@@ -199,29 +216,137 @@ def measure(bench: Bench, size_bytes: int, seconds: float) -> dict[str, float]:
     }
 
 
-def measure_jobs(bench: Bench, count: int) -> dict[str, float]:
-    """Claim and done of small results, one worker and eight."""
-    bench.jobs.submit([predict(index) for index in range(2 * count)])
+def measure_jobs(bench: Bench, size_bytes: int, first: int, count: int) -> dict[str, float]:
+    """Claim and done of results with one blob of a size, one worker and eight."""
+    width = max(2, round((size_bytes / 3) ** 0.5))  # incompressible: two bytes of depth and one of confidence a pixel
+    shape = width, max(2, round(size_bytes / 3 / width))
+    depths = {index: depth_blob(index, *shape) for index in range(first, first + 2 * count)}
+    bench.jobs.submit([predict(index) for index in depths])
     begin = time.perf_counter()
     for _ in range(count):
-        bench.claim_and_done()
+        bench.claim_and_done(depths, shape)
     one = count / (time.perf_counter() - begin)
     begin = time.perf_counter()
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda _: bench.claim_and_done(), range(count)))
-    return {"claim_done_per_s": one, "claim_done_8_workers_per_s": count / (time.perf_counter() - begin)}
+        list(pool.map(lambda _: bench.claim_and_done(depths, shape), range(count)))
+    return {
+        "result_bytes": len(depths[first]),
+        "claim_done_per_s": one,
+        "claim_done_8_workers_per_s": count / (time.perf_counter() - begin),
+    }
 
 
-def measure_follow(place: Site) -> dict[str, float]:
-    """A late follower reads the whole stream of small records."""
+def measure_follow(place: Site) -> list[dict[str, float]]:
+    """A late follower reads whole streams: small records, and keyframes with their images."""
     count = place.status().position("event")
     begin = time.perf_counter()
     follower = Follower(place.bus, "event", Event)
     for _ in range(count):
         assert follower.next(10.0) is not None
-    seconds = time.perf_counter() - begin
+    rows = [{"bytes": 100.0, "follow_records": float(count), "follow_per_s": count / (time.perf_counter() - begin)}]
     follower.close()
-    return {"follow_records": count, "follow_per_s": count / seconds}
+    ledger = place.client()
+    images = Follower(place.bus, "keyframe", Keyframe)
+    seconds: dict[int, list[float]] = {}
+    for _ in range(place.status().position("keyframe")):
+        begin = time.perf_counter()
+        followed = images.next(10.0)
+        assert followed is not None
+        of_size = seconds.setdefault(followed.record.image.size_bytes, [])
+        if len(of_size) < FOLLOWED:
+            ledger.blob(followed.record.image)
+            of_size.append(time.perf_counter() - begin)
+    images.close()
+    rows += [
+        {"bytes": float(size), "follow_records": float(len(spent)), "follow_per_s": len(spent) / sum(spent)}
+        for size, spent in sorted(seconds.items())
+    ]
+    return rows
+
+
+class Watched:
+    """CPU seconds of the processes of a run, by service; a computing child is ``SERVICE compute``."""
+
+    def __init__(self, run: psutil.Process) -> None:
+        self._run = run
+        self._names: dict[int, str] = {}
+        self.used: dict[int, float] = {}
+
+    def look(self) -> None:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for process in [self._run, *self._run.children(recursive=True)]:
+                with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):
+                    if process.pid not in self._names:
+                        self._names[process.pid] = self._name_of(process)
+                    times = process.cpu_times()
+                    self.used[process.pid] = times.user + times.system
+
+    def by_name(self) -> dict[str, float]:
+        total: dict[str, float] = defaultdict(float)
+        for pid, seconds in self.used.items():
+            total[self._names[pid]] += seconds
+        return total
+
+    def _name_of(self, process: psutil.Process) -> str:
+        line = process.cmdline()
+        if "serve" in line:
+            return line[line.index("serve") + 1]
+        if process.pid == self._run.pid:
+            return "run"
+        return f"{self._names.get(process.ppid(), 'run')} compute"
+
+
+def pixel_seconds(source: str) -> float:
+    """CPU seconds of the pure frontend for every frame of a source."""
+    cv2.setNumThreads(1)
+    pipeline = FrontendPipeline(Config().frontend, "front")
+    opened = open_source(source)
+    begin = time.process_time()
+    for frame in opened.frames():
+        pipeline.push(frame)
+    pipeline.finish()
+    return time.process_time() - begin
+
+
+def has_record(database: Path, stream: str, record_id: str) -> bool:
+    """Whether the log holds a record; read from its file, so that the ledger has no work with it."""
+    with contextlib.suppress(LedgerError), read_only(database) as reader:
+        return reader.find_record(stream, record_id) is not None
+    return False
+
+
+def measure_share(folder: Path, source: str) -> dict[str, float]:
+    """CPU seconds of one run."""
+    out = folder / "run"
+    command = [sys.executable, "-m", "vggt_motion", "run", source, "--out", str(out), "--set", "gateway.port=0"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    watched = Watched(psutil.Process(process.pid))
+    start_up: dict[str, float] = {}
+    frontend_start_up = run_until_graph = 0.0
+    is_sending = is_solved = False
+    while process.poll() is None:
+        watched.look()
+        now = watched.by_name()
+        if not start_up and "frontend" in now:
+            start_up = dict(now)
+        if start_up and not is_sending:
+            is_sending = has_record(out / "ledger" / "ledger.db", "event", "session_started")
+            frontend_start_up = now["frontend"]
+        if is_sending and not is_solved:
+            is_solved = has_record(out / "ledger" / "ledger.db", "graph", "graph/final")
+            run_until_graph = now["run"]
+        time.sleep(0.1)
+    assert process.returncode in (0, 3), f"the run ended with {process.returncode}"
+    start_up["frontend"] = frontend_start_up
+    used = {name: seconds - start_up.get(name, 0.0) for name, seconds in watched.by_name().items()}
+    numerics = {name: seconds for name, seconds in used.items() if name.endswith(" compute")}
+    numerics["frontend"] = min(pixel_seconds(source), used["frontend"])
+    numerics["run"] = max(0.0, used["run"] - (run_until_graph - start_up.get("run", 0.0)))
+    row = {f"{name}_fabric_s": round(used[name] - numerics.get(name, 0.0), 3) for name in used if name not in numerics}
+    row |= {f"{name}_fabric_s": used[name] - numerics[name] for name in ("frontend", "run")}
+    fabric, everything = sum(row.values()), sum(used.values())
+    row |= {f"{name.replace(' ', '_')}_numerics_s": seconds for name, seconds in numerics.items()}
+    return row | {"fabric_s": fabric, "all_s": everything, "fabric_share_percent": 100.0 * fabric / everything}
 
 
 def show(rows: list[dict[str, float]]) -> None:
@@ -235,6 +360,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--directory", type=Path, help="on a real disk; defaults to the folder for temporary files")
     parser.add_argument("--seconds", type=float, default=1.0, help="for each measurement of each round")
+    parser.add_argument("--source", default=str(SAMPLE), help="of the run whose CPU seconds are counted")
     parser.add_argument("--json", type=Path, help="write the rows here as well")
     # Internal: be the answerer.
     parser.add_argument("--serve", metavar="ENDPOINT", help=argparse.SUPPRESS)
@@ -246,8 +372,11 @@ def main() -> int:
         place = stack.enter_context(site(folder, "ledger.reserve_bytes=0"))
         bench = Bench(place, folder, stack)
         rows = [measure(bench, size_bytes, arguments.seconds) for size_bytes in SIZES_BYTES]
-        rows.append(measure_jobs(bench, 300))
-        rows.append(measure_follow(place))
+        for number, size_bytes in enumerate(SIZES_BYTES):
+            rows.append(measure_jobs(bench, size_bytes, 10_000 * number, JOBS if size_bytes < 1e6 else JOBS // 10))
+        rows += measure_follow(place)
+    with tempfile.TemporaryDirectory(dir=arguments.directory) as name:
+        rows.append(measure_share(Path(name), arguments.source))
     show(rows)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1))
