@@ -155,7 +155,7 @@ def start_sfm(fault_sample: Path, sfm_reference: Snapshot, tmp_path: Path) -> It
 
     def begin(*assignments: str, **options: Any) -> FaultRun:
         run = FaultRun(
-            source=fault_sample,
+            source=options.pop("source", fault_sample),
             out=tmp_path / f"run{len(runs)}",
             reference=sfm_reference,
             assignments=assignments,
