@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import power_loss
 import pytest
 from cutting_proxy import CuttingProxy
 from fault_run import FaultRun, Outcome, Snapshot, free_port, moments
 from test_fault_cross_section import SERVICES
 
+import power_loss
 from ledger_helpers import damage_blob
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.jobs import JobClient
@@ -42,6 +42,8 @@ from vggt_motion.records import (
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(900)]
 Start = Callable[..., FaultRun]
 Judge = Callable[[str, Outcome], Outcome]
+POWER_HOOK = Path(__file__).parent / "power_hook"
+TESTS = Path(__file__).parents[2]
 TWO_OF_EACH = ("run.inference_workers=2", "run.registration_workers=2")
 KILLS = 10
 KILL_ROUNDS = 4
@@ -237,25 +239,28 @@ def test_the_disk_fills_up(reserve_mb: int, start: Start, judge: Judge, small_di
     assert run.injected["ledger's disk full"] >= 2
 
 
-@pytest.mark.skipif(not power_loss.is_available(), reason="strace is not installed: what was synced cannot be known")
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.skipif(power_loss.sqlite_library() is None, reason="SQLite is linked so that it has no hooks")
+@pytest.mark.parametrize("number", range(6))
 def test_power_loss_and_resume_from_the_crash_image(
     number: int, start: Start, judge: Judge, generator: random.Random, tmp_path: Path
 ) -> None:
-    first = start(seconds_per_submap=1.0)
-    assert first.wait_until(lambda: first.processes("ledger"))
-    trace = power_loss.Trace(first.processes("ledger")[0], tmp_path / "strace.txt")
-    wanted = [Stream.KEYFRAME, Stream.SUBMAP, Stream.CONSTRAINT][number]
-    first.wait_until(lambda: first.count(wanted) > generator.randrange(1, 4))
-    first.wait_until(lambda: False, generator.uniform(0.0, 0.5))
+    """The power goes in the middle of a commit: written, not yet forced to the disk."""
+    file = tmp_path / "operations"
+    hook = {
+        "PYTHONPATH": os.pathsep.join([str(POWER_HOOK), str(TESTS), os.environ.get("PYTHONPATH", "")]),
+        power_loss.LOG_VARIABLE: str(file),
+        power_loss.CUT_VARIABLE: str(generator.randrange(20, 60 + 60 * number)),
+    }
+    first = start(seconds_per_submap=1.0, environment=hook)
+    cut = file.with_suffix(".cut")
+    assert first.wait_until(cut.exists), "the run was over before the power went"
     first.kill_everything()
-    trace.end()
-    unsafe = trace.unsafe(first.out / "ledger")
-    assert unsafe.sync_count > 10, "the trace saw nothing"
+    operations = power_loss.read_log(file)
     image = tmp_path / "image"
     shutil.copytree(first.out, image, ignore=shutil.ignore_patterns("ledger"))
-    lost = power_loss.crash_image(first.out / "ledger", image / "ledger", unsafe, generator)
-    print(f"{unsafe.sync_count} syncs, {unsafe.count} unsafe, of these: {lost}")
+    base = power_loss.read_base(file)
+    damaged = power_loss.crash_image(operations, base, image / "ledger", generator)
+    print(f"{len(operations)} operations, {damaged} writes or names lost or torn")
     second = start(seconds_per_submap=1.0, out=image)
     second.injected["power loss"] += 1
     second.witness.acknowledged.extend(first.witness.acknowledged)
