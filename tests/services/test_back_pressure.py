@@ -20,6 +20,7 @@ from vggt_motion.bus.images import encode_image
 from vggt_motion.config import FrontendConfig
 from vggt_motion.errors import BusError
 from vggt_motion.frontend.pipeline import FrontendPipeline, KeyframeOutput
+from vggt_motion.ledger.blobs import free_space
 from vggt_motion.records import Event, EventKind, Keyframe, Stream
 from vggt_motion.sources.registry import open_source
 from vggt_motion.sources.source import Frame
@@ -124,7 +125,7 @@ def test_slow_workers_hold_up_no_camera_and_the_lag_is_shown(tmp_path: Path, fra
     spool = {"directory": str(tmp_path / "spool")}
     with live_session(tmp_path, spool=spool) as session:
         gateway = session.started("gateway")
-        session.started("backend")
+        session.start("backend")
         frontend = session.start("frontend", "--source", "zenoh:front")
         url = f"http://127.0.0.1:{int(counters(session, gateway)['port'])}/api/v1/status"
         with camera(session, frames):
@@ -167,8 +168,12 @@ def test_thinning_lets_frames_of_a_file_go_by_while_the_disk_is_full(
     tmp_path: Path, sample_dir: Path, frames: list[Frame]
 ) -> None:
     """As a camera's would have: as many as the wait was long."""
+    reserve_bytes = free_space(tmp_path) * 3 // 2  # below it, but not below the half that is for everything but input
     with live_session(
-        tmp_path, frontend={"disk_policy": "thin"}, ledger={"reserve_bytes": 2**60}, run={"nominal_rate_hz": 10.0}
+        tmp_path,
+        frontend={"disk_policy": "thin"},
+        ledger={"reserve_bytes": reserve_bytes},
+        run={"nominal_rate_hz": 10.0},
     ) as session:
         frontend = session.start("frontend", "--source", str(sample_dir / "kitti_06_first51" / "image_0"))
         begin = time.monotonic()
@@ -179,7 +184,7 @@ def test_thinning_lets_frames_of_a_file_go_by_while_the_disk_is_full(
         time.sleep(1.5)
         session.services[1].kill()
         text = session.config_file.read_text(encoding="utf-8")
-        session.config_file.write_text(text.replace(str(2**60), "0"), encoding="utf-8")
+        session.config_file.write_text(text.replace(str(reserve_bytes), "0"), encoding="utf-8")
         session.start("ledger", "--directory", str(tmp_path / "ledger"))
         assert frontend.process.wait(60) == 0, frontend.text()
         waited_s = time.monotonic() - begin

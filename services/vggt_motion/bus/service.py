@@ -65,6 +65,10 @@ class ServiceContext:
         if has_changed and self._announcement is not None:
             self._announcement.publish_now()
 
+    def set_counters(self, **counters: float) -> None:
+        """Renew some counters; state and detail stay as they are. May be called from any thread."""
+        self._health.count(counters)
+
     def announce(self) -> Announcement:
         """Declare the token and begin to send health; called by :func:`run_service`."""
         self._announcement = Announcement(self.bus, self.service, self.instance, self._health.report)
@@ -77,6 +81,10 @@ class _Health:
         self._service, self._instance = service, instance
         self._state, self._detail = "starting", ""
         self._counters: dict[str, float] = {}
+
+    def count(self, counters: dict[str, float]) -> None:
+        with self._lock:
+            self._counters.update(counters)
 
     def update(self, state: str, detail: str, counters: dict[str, float]) -> bool:
         with self._lock:

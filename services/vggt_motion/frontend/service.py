@@ -166,7 +166,7 @@ class _Frontend:
         truncation: SourceTruncatedError | None = None
         is_over = threading.Event()
         if self._source.is_live:
-            threading.Thread(target=self._tell_of_silence, args=(is_over,), name="silence", daemon=True).start()
+            threading.Thread(target=self._watch, args=(is_over,), name="watch", daemon=True).start()
         try:
             for frame in self._arriving():
                 if self._context.stopping.is_set():
@@ -206,14 +206,15 @@ class _Frontend:
             yield frame
             self._waiting_since = time.monotonic()
 
-    def _tell_of_silence(self, is_over: threading.Event) -> None:
-        """Say in the status that a live camera has stalled; its next frame takes that back."""
+    def _watch(self, is_over: threading.Event) -> None:
+        """Count for the status while no frame of a live camera comes or none is taken, and say when it has stalled."""
         while not is_over.wait(_REPORT_S):
+            self._context.set_counters(**self._counters())
             since = self._waiting_since
             if since is None or (silent_s := time.monotonic() - since) < _SILENT_S:
                 continue
             detail = f"no frame comes from {self._source.description}"
-            self._context.set_health("waiting", detail, silent_s=round(silent_s, 1), **losses_of(self._source))
+            self._context.set_health("waiting", detail, silent_s=round(silent_s, 1))
 
     def _frame_interval_s(self) -> float | None:
         """As measured over the last frames: the rate of a live camera changes, and the bus knows none."""
@@ -320,30 +321,35 @@ class _Frontend:
         self._newest_time_ns = frame.capture_time_ns
         return False
 
+    def _counters(self) -> dict[str, float]:
+        pipeline = self._pipeline
+        return {
+            "frames": pipeline.frame_count,
+            "keyframes": pipeline.keyframe_count,
+            "segments": pipeline.segment_count,
+            "static_frames": pipeline.state_counts[MotionState.STATIC],
+            "turning_frames": pipeline.state_counts[MotionState.TURNING],
+            "linear_frames": pipeline.state_counts[MotionState.LINEAR],
+            "thinned_frames": self._thinned_count,
+            "unreadable_frames": self._unreadable_count,
+            **({} if self._outbox is None else self._outbox.counters()),
+            **losses_of(self._source),
+        }
+
     def _report(self, state: str, *, is_due: bool = False) -> None:
         now = time.monotonic()
         if not is_due and now < self._next_report:
             return
         self._next_report = now + _REPORT_S
-        pipeline = self._pipeline
-        delay = pipeline.lookahead_frames
+        delay = self._pipeline.lookahead_frames
         interval_s = self._frame_interval_s()
         self._context.set_health(
             state,
             self._source.description,
-            frames=pipeline.frame_count,
-            keyframes=pipeline.keyframe_count,
-            segments=pipeline.segment_count,
-            static_frames=pipeline.state_counts[MotionState.STATIC],
-            turning_frames=pipeline.state_counts[MotionState.TURNING],
-            linear_frames=pipeline.state_counts[MotionState.LINEAR],
             smoothing_delay_frames=delay,
-            thinned_frames=self._thinned_count,
-            unreadable_frames=self._unreadable_count,
-            **({} if self._outbox is None else self._outbox.counters()),
             **({} if interval_s is None else {"smoothing_delay_s": delay * interval_s}),
             **({"silent_s": 0.0} if self._source.is_live else {}),
-            **losses_of(self._source),
+            **self._counters(),
         )
 
 
@@ -386,12 +392,13 @@ class _Outbox:
             if not is_full:
                 is_full = True
                 self._full_count += 1
-                self._context.set_health("waiting", "the spool is full: frames go by", **self.counters())
+            self._context.set_health("waiting", "the spool is full: frames go by", **self.counters())
         self._check()
 
     def send_all(self) -> None:
         """Wait until everything is acknowledged; told to stop, leave the rest to the next frontend."""
         while not self._spool.wait_until_empty(_SPOOL_POLL_S) and not self._context.stopping.is_set():
+            self._context.set_counters(**self.counters())
             self._check()
 
     def _check(self) -> None:
