@@ -46,7 +46,7 @@ from vggt_motion.sources.source import Frame
 
 _log = logging.getLogger(__name__)
 RECORDING_FILE = "run.mcap"
-_POLL_S = 0.02
+_POLL_S = 0.05
 _REPORT_S = 0.5
 _RECORDS_A_TURN = 100
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
