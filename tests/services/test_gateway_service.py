@@ -77,7 +77,14 @@ def test_the_gateway_shows_what_the_ledger_holds(tmp_path: Path, session: Sessio
                 ),
                 "all records",
             )
-            assert {"ledger", "gateway"} <= {service["service"] for service in status["services"]}
+            # Tokens of liveliness come one by one, and the gateway looks at them now and then.
+            wait_for(
+                lambda: (
+                    {"ledger", "gateway"}
+                    <= {service["service"] for service in client.get("/api/v1/status").json()["services"]}
+                ),
+                "the services",
+            )
             assert status["ledger"]["is_accepting"] is True
             text = client.get("/api/v1/trajectory?format=tum&frames=key").text
             rows = np.array([[float(field) for field in line.split()] for line in text.splitlines()])
