@@ -208,7 +208,7 @@ log_entries = st.builds(LogEntry, names, indices, identifiers, st.just("vggt_mot
 statuses = st.builds(
     LedgerStatus, st.lists(st.builds(StreamPosition, names, indices), max_size=3).map(tuple),
     st.lists(st.builds(JobCount, names, names, indices), max_size=3).map(tuple),
-    indices, indices, st.booleans(), lines, indices,
+    indices, indices, st.booleans(), lines, indices, st.from_regex(r"[0-9a-f]{0,32}", fullmatch=True),
 )  # fmt: skip
 appends = st.builds(
     calls.AppendRequest, names, identifiers, st.just("vggt_motion.v1.Event"), st.binary(),
