@@ -228,6 +228,9 @@ class InferenceConfig(Section):
     job_deadline_s: float = Field(
         300.0, gt=0, description="a prediction that takes longer is ended and reported as failed"
     )
+    load_deadline_s: float = Field(
+        3600.0, gt=0, description="what loading the predictor may take, a download of its weights included"
+    )
     sfm: SfmConfig = SfmConfig()
     vggt: VggtConfig = VggtConfig()
     pi3: ForeignConfig = ForeignConfig(model="yyfz233/Pi3")

@@ -8,7 +8,7 @@ import math
 import os
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,7 +39,7 @@ from vggt_motion.evaluation.summary import error_table, is_kitti
 from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_csv, to_kitti, to_tum
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.geometry.track import PoseTrack
-from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, SubmapVerdict
+from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, SubmapGeometry, SubmapVerdict
 
 METRICS_FILE = "metrics.json"
 _MIN_ALIGNED_POSES = 3
@@ -230,6 +230,12 @@ def _reference_of(
     return PoseTrack(times, poses[np.array([line for _, line in pairs], dtype=np.intp)])
 
 
+def _median_focal(submaps: Iterable[SubmapGeometry]) -> float | None:
+    """What the submaps used where none of them claims to know it: a given focal length, or those of a network."""
+    used = [submap.quality.focal_over_width for submap in submaps if submap.quality.focal_over_width > 0.0]
+    return float(np.median(used)) if used else None
+
+
 def _alignments(trajectory: Trajectory, reference: PoseTrack) -> dict[int, Sim3]:
     aligned = {}
     for component in trajectory.components:
@@ -291,7 +297,7 @@ def _metrics(
         f"path_length_{unit}": trajectory.path_length(),
         "pose_origins": {origin.value: count for origin, count in sorted(trajectory.origin_counts().items())},
         "motion_states": dict(sorted(states.items())),
-        "focal_over_width": hint.focal_over_width if hint is not None else None,
+        "focal_over_width": hint.focal_over_width if hint is not None else _median_focal(submaps.values()),
         "focal_relative_sigma": hint.relative_sigma if hint is not None else None,
         "video_seconds": _video_seconds(trajectory),
         "wall_seconds": facts.wall_seconds,

@@ -1,9 +1,11 @@
 """Memory and time of VGGT on this machine's CPU, beside a plain variant of the same network in the same run.
 
-The plain variant keeps the outputs of all levels, takes all frames and tokens at once everywhere and builds what a
-complete implementation has: depth and point heads, which it runs, and the tracking head's parameters. Weights are made
-by rule (rule_weights.py). Each measurement is a process of its own. The default is the published 1B network and needs
-up to 10 GB and some minutes. Run: ``python tests/benchmarks/bench_vggt.py [--configuration small] [--json FILE]``.
+The plain variant keeps its weights in memory and the outputs of all levels, takes all frames and tokens at once
+everywhere and builds what a complete implementation has: depth and point heads, which it runs, and the tracking head's
+parameters. Weights are made by rule (rule_weights.py) and written to a checkpoint once, from which both load. Each
+measurement is a process of its own. The default is the published 1B network and needs up to 10 GB of memory, 5 GB of
+disk and some minutes. Run:
+``python tests/benchmarks/bench_vggt.py [--configuration small] [--dtypes bfloat16] [--checkpoint FILE] [--json FILE]``.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,7 +32,7 @@ from torch import Tensor
 
 from rule_weights import rule_weight
 from vggt_motion.inference.vggt.architecture import SMALL, VGGT_1B, VggtArchitecture
-from vggt_motion.inference.vggt.checkpoint import inference_dtype, weight_bytes
+from vggt_motion.inference.vggt.checkpoint import inference_dtype, load_model, open_checkpoint
 from vggt_motion.inference.vggt.dense_head import DenseHead, activate_depth, activate_points
 from vggt_motion.inference.vggt.memory import host_available_bytes, pass_bytes
 from vggt_motion.inference.vggt.model import DEFAULT_FRAME_CHUNK, Vggt, VggtOutput
@@ -37,6 +40,7 @@ from vggt_motion.inference.vggt.predictor import pinhole_matrices, submap_from_c
 from vggt_motion.inference.vggt.stopwatch import Stopwatch
 
 ARCHITECTURES = {"vggt_1b": VGGT_1B, "small": SMALL}
+DTYPES = ("float32", "bfloat16")
 GEMM_SECONDS = 3.0
 
 
@@ -46,6 +50,7 @@ class Measurement:
 
     variant: str
     dtype: str
+    load_seconds: float
     weights_bytes: int  # resident before the pass, above what Python and torch take alone
     peak_bytes: int  # resident, all
     seconds: float
@@ -56,17 +61,38 @@ class Measurement:
     gemm_float32_flops: float
 
 
-def build(architecture: VggtArchitecture, dtype: torch.dtype, *, is_plain: bool) -> Vggt:
-    """A network with rule weights, made one parameter at a time so that making them leaves no peak."""
+def parameter_shapes(architecture: VggtArchitecture) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a published checkpoint, all heads included."""
     with torch.device("meta"):
-        model = Vggt(architecture, with_points=is_plain, with_tracking=is_plain)
-    state = {}
-    for name, value in model.state_dict().items():
-        weight = torch.from_numpy(np.ascontiguousarray(rule_weight(name, tuple(value.shape))))
-        state[name] = weight.to(inference_dtype(name, dtype))
+        model = Vggt(architecture, with_points=True, with_tracking=True)
+    return {name: tuple(value.shape) for name, value in model.state_dict().items()}
+
+
+def write_checkpoint(architecture: VggtArchitecture, path: Path) -> None:
+    """A checkpoint of rule weights, as the published ones are: float32, every head."""
+    shapes = parameter_shapes(architecture)
+    # "~": the name of an unfinished file must not pass for the checkpoint
+    unfinished = path.with_name(path.name + "~")
+    torch.save(
+        {name: torch.from_numpy(np.ascontiguousarray(rule_weight(name, shapes[name]))) for name in shapes}, unfinished
+    )
+    unfinished.rename(path)
+
+
+def warm(path: Path) -> None:
+    """Read a file, so that the page cache has it: disks are not what is measured."""
+    with path.open("rb", buffering=0) as file:
+        while file.read(2**24):
+            pass
+
+
+def build_plain(architecture: VggtArchitecture, path: Path, dtype: torch.dtype) -> Vggt:
+    """All parameters of a checkpoint in memory."""
+    with torch.device("meta"):
+        model = Vggt(architecture, with_points=True, with_tracking=True)
+    checkpoint = open_checkpoint(path)
+    state = {name: checkpoint.read(name).to(inference_dtype(name, dtype), copy=True) for name in model.state_dict()}
     model.load_state_dict(state, strict=True, assign=True)
-    if not is_plain:
-        model.depth_head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model.eval().requires_grad_(False)
 
 
@@ -156,18 +182,23 @@ def resident(field: str) -> int:
 
 
 def measure(arguments: argparse.Namespace) -> Measurement:
-    """In this process: build, run once, report."""
+    """In this process: load, run once, report."""
     torch.set_num_threads(arguments.threads)
     architecture, dtype = ARCHITECTURES[arguments.configuration], getattr(torch, arguments.dtype)
     is_plain = arguments.variant == "plain"
     images = torch.rand(1, arguments.frames, 3, *arguments.size, generator=torch.Generator().manual_seed(0))
-    warm = build(SMALL, dtype, is_plain=is_plain)  # what libraries allocate once is not the network's
-    (PlainPass(warm) if is_plain else warm)(images[:, :1, :, :28, :28])
-    del warm
+    warm_up = Vggt(SMALL).eval()  # what libraries allocate once is not the network's
+    warm_up(images[:, :1, :, :28, :28])
+    del warm_up
     ctypes.CDLL(None).malloc_trim(0)
     alone = resident("VmRSS")
-    model = build(architecture, dtype, is_plain=is_plain)
-    run = PlainPass(model) if is_plain else model
+    start = time.perf_counter()
+    if is_plain:
+        model = build_plain(architecture, arguments.checkpoint, dtype)
+        run = PlainPass(model)
+    else:
+        run = model = load_model(open_checkpoint(arguments.checkpoint), dtype, torch.device("cpu"))
+    load_seconds = time.perf_counter() - start
     ctypes.CDLL(None).malloc_trim(0)
     before = resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak
@@ -182,7 +213,17 @@ def measure(arguments: argparse.Namespace) -> Measurement:
     rate = gemm_rate(dtype, tokens, architecture.width)
     rate32 = rate if dtype == torch.float32 else gemm_rate(torch.float32, tokens, architecture.width)
     return Measurement(
-        arguments.variant, arguments.dtype, before - alone, peak, seconds, cpu_seconds, parts, depth_sum, rate, rate32
+        variant=arguments.variant,
+        dtype=arguments.dtype,
+        load_seconds=load_seconds,
+        weights_bytes=before - alone,
+        peak_bytes=peak,
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+        parts=parts,
+        depth_sum=depth_sum,
+        gemm_flops=rate,
+        gemm_float32_flops=rate32,
     )
 
 
@@ -196,10 +237,15 @@ def precision(configuration: str) -> dict[str, dict[str, float]]:
         pixels = np.random.default_rng(0).integers(0, 256, (3, 98, 140, 3), dtype=np.uint8)
     images = torch.from_numpy(pixels).permute(0, 3, 1, 2)[None].float() / 255
     architecture = ARCHITECTURES[configuration]
-    exact = build(architecture, torch.float32, is_plain=False)(images)
     result = {}
-    for dtype in (torch.bfloat16, torch.float16):
-        reduced = build(architecture, dtype, is_plain=False)(images)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "small.pt"
+        write_checkpoint(architecture, path)
+        exact, bfloat16, float16 = (
+            load_model(open_checkpoint(path), dtype, torch.device("cpu"))(images)
+            for dtype in (torch.float32, torch.bfloat16, torch.float16)
+        )
+    for dtype, reduced in ((torch.bfloat16, bfloat16), (torch.float16, float16)):
         encodings = [output.pose_encoding[0].double().numpy() for output in (exact, reduced)]
         poses = [submap_from_camera(encoding) for encoding in encodings]
         focal = [pinhole_matrices(encoding, pixels.shape[2], pixels.shape[1])[:, 0, 0] for encoding in encodings]
@@ -216,6 +262,22 @@ def precision(configuration: str) -> dict[str, dict[str, float]]:
     return result
 
 
+def run_all(arguments: argparse.Namespace, checkpoint: Path) -> dict[str, dict[str, Measurement]]:
+    """Each measurement in a process of its own: dtype -> variant -> result."""
+    measurements: dict[str, dict[str, Measurement]] = {}
+    for dtype in arguments.dtypes:
+        for variant in ("plain", "lean"):
+            command = [sys.executable, __file__, "--variant", variant, "--dtype", dtype]
+            for name in ("configuration", "frames", "threads"):
+                command += [f"--{name}", str(getattr(arguments, name))]
+            command += ["--checkpoint", str(checkpoint), "--size", *map(str, arguments.size)]
+            warm(checkpoint)
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            measurements.setdefault(dtype, {})[variant] = Measurement(**json.loads(done.stdout.splitlines()[-1]))
+            report(measurements[dtype][variant], arguments)
+    return measurements
+
+
 def report(measurement: Measurement, arguments: argparse.Namespace) -> None:
     operations = flops(ARCHITECTURES[arguments.configuration], arguments.frames, arguments.size)
     if measurement.variant == "plain":
@@ -223,7 +285,8 @@ def report(measurement: Measurement, arguments: argparse.Namespace) -> None:
     print(
         f"\n{measurement.variant} {measurement.dtype}: {measurement.seconds:.1f} s, "
         f"CPU {measurement.cpu_seconds:.1f} s, "
-        f"peak {gib(measurement.peak_bytes)}, weights {gib(measurement.weights_bytes)}, "
+        f"peak {gib(measurement.peak_bytes)}, {gib(measurement.weights_bytes)} of weights before the pass, "
+        f"loaded in {measurement.load_seconds:.1f} s, "
         f"GEMM {measurement.gemm_flops / 1e9:.0f} GFLOP/s (float32 {measurement.gemm_float32_flops / 1e9:.0f})"
     )
     limit_sum = 0.0
@@ -249,6 +312,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=17)
     parser.add_argument("--size", type=int, nargs=2, default=(154, 518), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--dtypes", nargs="+", choices=DTYPES, default=DTYPES, help="measure these only")
+    parser.add_argument("--checkpoint", type=Path, help="of rule weights; written if it is not there; None = for once")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--variant", choices=("lean", "plain"), help=argparse.SUPPRESS)  # in the child
     parser.add_argument("--dtype", help=argparse.SUPPRESS)
@@ -258,7 +323,7 @@ def main() -> None:
         print(json.dumps(asdict(measure(arguments))))
         return
     architecture = ARCHITECTURES[arguments.configuration]
-    needed = 2 * weight_bytes(architecture, torch.float32)
+    needed = 8 * sum(math.prod(shape) for shape in parameter_shapes(architecture).values())
     if needed > host_available_bytes():
         sys.exit(
             f"bench_vggt: about {gib(needed)} are needed, {gib(host_available_bytes())} are free: --configuration small"
@@ -266,16 +331,11 @@ def main() -> None:
     size = f"{arguments.size[1]}x{arguments.size[0]}"
     print(f"{arguments.configuration}, {arguments.frames} frames of {size}, {arguments.threads} threads")
     print(f"torch {torch.__version__}")
-    measurements: dict[str, dict[str, Measurement]] = {}
-    for dtype in ("float32", "bfloat16"):
-        for variant in ("plain", "lean"):
-            command = [sys.executable, __file__, "--variant", variant, "--dtype", dtype]
-            for name in ("configuration", "frames", "threads"):
-                command += [f"--{name}", str(getattr(arguments, name))]
-            command += ["--size", *map(str, arguments.size)]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            measurements.setdefault(dtype, {})[variant] = Measurement(**json.loads(done.stdout.splitlines()[-1]))
-            report(measurements[dtype][variant], arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint = arguments.checkpoint or Path(folder) / "rule.pt"
+        if not checkpoint.is_file():
+            write_checkpoint(architecture, checkpoint)
+        measurements = run_all(arguments, checkpoint)
     print()
     for dtype, pair in measurements.items():
         lean, plain = pair["lean"], pair["plain"]

@@ -182,6 +182,31 @@ def test_a_known_camera_needs_no_waiting_and_no_second_revision() -> None:
     assert {job.kind for job in planner.next_jobs(state, config)} == {JobKind.REGISTER}
 
 
+@pytest.mark.parametrize("predictor", ["vggt", "pi3", "pi3x", "depth_anything_3", "map_anything"])
+def test_networks_take_no_hint_so_nothing_waits_for_one_and_nothing_is_predicted_twice(predictor: str) -> None:
+    config = load_config(assignments=[f"inference.predictor={predictor}"])
+    # focal lengths and sigmas as bad as can be: they must not matter
+    state = started(9)
+    jobs = planner.next_jobs(state, config)
+    assert [job.job_id for job in jobs] == [whole(k) for k in range(9)]
+    for k, job in enumerate(jobs):
+        assert isinstance(job.task, PredictTask) and job.task.spec.focal_hint is None
+        state.apply(geometry(job.task.spec, 0.4 + 0.05 * k, sigma=0.001))
+    jobs = planner.next_jobs(state, config)
+    assert {job.kind for job in jobs} == {JobKind.REGISTER}
+    for job in jobs:
+        assert isinstance(job.task, RegisterTask)
+        state.apply(constraint(job.task))
+    assert planner.is_complete(state, config)
+
+
+def test_submaps_without_a_sigma_neither_give_hints_nor_are_predicted_twice() -> None:
+    """What workers with ``auto`` send where they chose a network."""
+    state = started(7)
+    run(state, random.Random(0), {k: 0.4 + 0.05 * k for k in range(7)}, sigma=math.nan)
+    assert {(g.spec.revision, g.spec.focal_hint) for g in state.submaps.values()} == {(1, None)}
+
+
 def test_submaps_that_the_settled_estimate_contradicts_are_predicted_once_more() -> None:
     state = started(8)
     run(state, random.Random(0), {0: 0.7, 1: 0.575}, sigma=0.01)

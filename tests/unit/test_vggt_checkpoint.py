@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import sys
 import types
 from pathlib import Path
@@ -17,11 +18,12 @@ from vggt_motion.inference.vggt import memory, weights  # noqa: E402
 from vggt_motion.inference.vggt.architecture import SMALL, VGGT_1B  # noqa: E402
 from vggt_motion.inference.vggt.checkpoint import (  # noqa: E402
     CheckpointError,
+    copied_bytes,
     inference_dtype,
     load_model,
     open_checkpoint,
-    weight_bytes,
 )
+from vggt_motion.inference.vggt.mapped import FileMapping, mapping_of  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
 
 State = dict[str, "torch.Tensor"]
@@ -65,8 +67,6 @@ class TestLoading:
         assert dtypes["aggregator.patch_embed.patch_embed.proj.weight"] == torch.bfloat16
         for name in ("aggregator.frame_blocks.0.norm1.weight", "camera_head.trunk.0.mlp.fc1.weight"):
             assert dtypes[name] == torch.float32
-        halves = sum(value.numel() for value in model.state_dict().values() if value.dtype == torch.bfloat16)
-        assert weight_bytes(TINY, torch.float32) - weight_bytes(TINY, torch.bfloat16) == 2 * halves
 
     def test_missing_unexpected_and_misshapen_are_listed(self, state: State, tmp_path: Path) -> None:
         broken = dict(state)
@@ -101,6 +101,88 @@ class TestLoading:
         broken = {**state, name: torch.zeros(128, dtype=torch.int64)}
         with pytest.raises(InputError, match=name):
             load_model(open_checkpoint(saved(broken, tmp_path / "whole.pt")), torch.float32, CPU)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="weights stay in their file on Linux only")
+class TestWeightsThatStayInTheFile:
+    @pytest.mark.parametrize("name", ["tiny.pt", "tiny.safetensors"])
+    def test_what_fits_is_not_copied_and_what_does_not_is(self, state: State, tmp_path: Path, name: str) -> None:
+        path = saved(state, tmp_path / name)
+        for dtype in (torch.float32, torch.bfloat16):
+            model = load_model(open_checkpoint(path), dtype, CPU)
+            mapping = mapping_of(path)
+            for key, value in model.state_dict().items():
+                if not key.startswith("depth_head."):
+                    assert mapping.holds(value) == (value.dtype == torch.float32), key
+
+    def test_memory_is_that_of_the_copies(self, state: State, tmp_path: Path) -> None:
+        path = saved(state, tmp_path / "tiny.pt")
+        head = sum(value.numel() for key, value in state.items() if key.startswith("depth_head."))
+        halves = sum(
+            value.numel() for key, value in state.items() if inference_dtype(key, torch.bfloat16) != value.dtype
+        )
+        mapped, old = open_checkpoint(path), tmp_path / "old.pt"
+        torch.save(state, old, _use_new_zipfile_serialization=False)
+        points = sum(value.numel() for key, value in state.items() if key.startswith("point_head."))
+        whole = sum(value.numel() for value in state.values()) - points
+        assert copied_bytes(mapped, TINY, torch.float32, CPU) == 4 * head
+        assert copied_bytes(mapped, TINY, torch.bfloat16, CPU) == 4 * head + 2 * halves
+        assert copied_bytes(open_checkpoint(old), TINY, torch.float32, CPU) == 4 * whole
+        assert copied_bytes(mapped, TINY, torch.float32, torch.device("cuda")) == 4 * whole
+
+    def test_a_pass_gives_back_what_it_read_and_reads_it_again(self, tmp_path: Path) -> None:
+        with torch.device("meta"):
+            shapes = {key: tuple(value.shape) for key, value in Vggt(SMALL).state_dict().items()}
+        weights = {key: torch.from_numpy(value) for key, value in rule_weights(shapes).items()}
+        images = torch.rand(1, 2, 3, 28, 42, generator=torch.Generator().manual_seed(0))
+        held = Vggt(SMALL)
+        held.load_state_dict(weights)
+        expected = held.eval()(images)
+        for name in ("small.pt", "small.safetensors"):
+            path = saved(weights, tmp_path / name)
+            model = load_model(open_checkpoint(path), torch.float32, CPU)
+            size = path.stat().st_size
+            for _ in range(2):
+                output = model(images)
+                assert torch.equal(output.depth, expected.depth)
+                assert torch.equal(output.pose_encoding, expected.pose_encoding)
+                assert _mapped_resident_bytes(path) < 0.1 * size, "left behind: norms, tokens, ends of pages"
+            total = sum(float(value.double().sum()) for value in model.state_dict().values())
+            assert total != 0.0
+            assert _mapped_resident_bytes(path) > 0.5 * size, "the measure sees pages that are in use"
+
+    def test_only_whole_private_pages_of_the_file_itself(self, tmp_path: Path) -> None:
+        page = mmap.PAGESIZE
+        file = tmp_path / "weights.pt"
+        maps = tmp_path / "maps"
+        maps.write_text(
+            f"{0x10000:x}-{0x20000:x} rw-p 00000000 fe:00 1                    {file}\n"
+            f"{0x30000:x}-{0x40000:x} r--s 00000000 fe:00 1                    {file}\n"
+            f"{0x50000:x}-{0x60000:x} rw-p 00000000 fe:00 1                    {file} (deleted)\n"
+            f"{0x70000:x}-{0x80000:x} rw-p 00000000 00:00 0 \n"
+        )
+        assert mapping_of(file, maps) == FileMapping(((0x10000, 0x20000),))
+        assert mapping_of(file, tmp_path / "none") == FileMapping(())
+        values = torch.zeros(4 * page, dtype=torch.uint8)
+        begin = values.data_ptr()
+        mapping = FileMapping(((begin, begin + len(values)),))
+        ((first, last),) = mapping.pages_of([values[1 : 2 * page], values[2 * page : 4 * page - 1]])
+        assert first % page == last % page == 0
+        assert begin < first <= begin + page
+        assert begin + 3 * page - 1 < last < begin + 4 * page
+        assert mapping.pages_of([torch.zeros(4 * page), values[:1]]) == []
+
+
+def _mapped_resident_bytes(path: Path) -> int:
+    """Pages of a file that are in this process's memory."""
+    total, is_ours = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        fields = line.split()
+        if "-" in fields[0]:
+            is_ours = line.endswith(str(path))
+        elif is_ours and fields[0] == "Rss:":
+            total += int(fields[1]) * 1024
+    return total
 
 
 class TestDamagedFiles:
@@ -238,7 +320,7 @@ class TestMemory:
         (inner.parent / "memory.max").write_text("50000\n")
         (inner.parent / "memory.current").write_text("30000\n")
         (inner.parent / "memory.stat").write_text("anon 20000\ninactive_file 10000\nactive_file 5\n")
-        assert memory.host_available_bytes(proc, groups) == 30000
+        assert memory.host_available_bytes(proc, groups) == 30005
 
     def test_host_has_memory(self) -> None:
         assert 0 < memory.available_bytes(CPU) < 2**50

@@ -8,17 +8,21 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'vggt-motion[torch]'")
 
-from rule_weights import fixture_dir, rule_weights  # noqa: E402
+import vggt_reference  # noqa: E402
+from rule_weights import TINY, fixture_dir, rule_weights  # noqa: E402
 from vggt_motion.errors import InputError  # noqa: E402
 from vggt_motion.inference.vggt.architecture import SMALL, VGGT_1B, VggtArchitecture, architecture_of  # noqa: E402
+from vggt_motion.inference.vggt.backbone import VisionTransformer  # noqa: E402
 from vggt_motion.inference.vggt.dense_head import Fusion, add_position, axis_encoding  # noqa: E402
 from vggt_motion.inference.vggt.layers import Block, Rotary  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
 
+Weights = Mapping[str, npt.NDArray[np.float32]]
 # sha256 over the sorted lines "name shape" of the published 1B model's state dict and of the small configuration's
 NAME_DIGESTS = {
     "vggt_1b": "f5bcc85a31452cd37bb0be6721c3a8ffa498beb82974e8eb215a423eb4b01d4a",
@@ -46,6 +50,14 @@ def small() -> Vggt:
     weights = rule_weights(shapes_of(model))
     model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()}, assign=True)
     return model.eval()
+
+
+@pytest.fixture(scope="module")
+def tiny() -> tuple[Vggt, Weights]:
+    model = meta_model(TINY, with_points=True)
+    weights = rule_weights(shapes_of(model))
+    model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()}, assign=True)
+    return model.eval(), weights
 
 
 def random_images(frames: int, height: int, width: int, seed: int = 0) -> torch.Tensor:
@@ -77,6 +89,67 @@ class TestAgainstReference:
         shapes = {key: tuple(value) for key, value in expected.items()}
         assert shapes_of(meta_model(architecture, with_points=True, with_tracking=with_tracking)) == shapes
         assert digest(shapes) == NAME_DIGESTS[name]
+
+
+class TestOtherImagesAndSizes:
+    """Against a second implementation, float64, which has to pass the reference's own outputs first."""
+
+    NAMES = ("pose_enc", "depth", "depth_conf", "world_points", "world_points_conf")
+
+    def test_the_second_implementation_equals_the_reference(self, small: Vggt) -> None:
+        expected = np.load(fixture_dir("vggt") / "small_expected.npz")
+        images = torch.from_numpy(expected["images_uint8"]).permute(0, 3, 1, 2).double() / 255
+        weights = {name: value.numpy() for name, value in small.state_dict().items()}
+        found = vggt_reference.predict(weights, SMALL, images)
+        for name in self.NAMES:
+            np.testing.assert_allclose(found[name].numpy(), expected[name], rtol=1e-4, atol=1e-4, err_msg=name)
+
+    @pytest.mark.parametrize(
+        ("frames", "height", "width"),
+        [
+            (1, 28, 42),
+            (2, 42, 28),
+            (3, 98, 42),  # upright
+            (2, 70, 70),  # the side for which the positional embedding was learned: taken as it is
+            (2, 84, 84),  # larger than that
+            (1, 14, 126),  # one row of patches
+            (4, 140, 14),
+        ],
+    )
+    def test_equals_it_on_any_size(self, tiny: tuple[Vggt, Weights], frames: int, height: int, width: int) -> None:
+        model, weights = tiny
+        images = random_images(2 * frames, height, width, seed=height + width).view(2, frames, 3, height, width)
+        output = model(images, frame_chunk=3)
+        assert output.points is not None and output.point_confidence is not None
+        found = (output.pose_encoding, output.depth, output.depth_confidence, output.points, output.point_confidence)
+        shapes = [(9,), (height, width), (height, width), (height, width, 3), (height, width)]
+        assert [value.shape for value in found] == [(2, frames, *shape) for shape in shapes]
+        for index in range(2):
+            expected = vggt_reference.predict(weights, TINY, images[index])
+            for name, value in zip(self.NAMES, found, strict=True):
+                np.testing.assert_allclose(value[index], expected[name], rtol=1e-4, atol=1e-4, err_msg=name)
+
+    @pytest.mark.parametrize(("rows", "columns"), [(11, 37), (37, 11), (3, 40), (50, 60), (36, 37)])
+    def test_positional_embedding_is_resized_as_pillow_does(self, rows: int, columns: int) -> None:
+        image_module = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+        backbone = VisionTransformer(8, 1, 1)
+        torch.nn.init.normal_(backbone.pos_embed, generator=torch.Generator().manual_seed(4))
+        found = backbone.positions(rows, columns)[0].detach().numpy()
+        learned = backbone.pos_embed[0].detach().numpy()
+        np.testing.assert_array_equal(found[0], learned[0])
+        for channel in range(8):
+            image = image_module.fromarray(np.ascontiguousarray(learned[1:, channel].reshape(37, 37)))
+            expected = np.asarray(image.resize((columns, rows), image_module.Resampling.BICUBIC))
+            np.testing.assert_allclose(found[1:, channel].reshape(rows, columns), expected, atol=1e-4)
+
+    def test_positional_embedding_of_the_learned_size_is_taken_as_it_is(self) -> None:
+        backbone = VisionTransformer(8, 1, 1)
+        assert backbone.positions(37, 37) is backbone.pos_embed
+
+    @pytest.mark.parametrize(("height", "width"), [(100, 140), (98, 141)])
+    def test_sides_that_patches_do_not_cover_are_refused(self, small: Vggt, height: int, width: int) -> None:
+        with pytest.raises(ValueError, match=rf"{width}x{height}: both sides must be divisible by 14"):
+            small(random_images(1, height, width))
 
 
 class TestArchitecture:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -15,17 +16,33 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'vggt-motion[torch]'")
 
 from rule_weights import TINY, fixture_dir, rule_weights  # noqa: E402
-from vggt_motion.config import InferenceConfig, VggtConfig  # noqa: E402
+from vggt_motion.backend import planner  # noqa: E402
+from vggt_motion.backend.state import LogState  # noqa: E402
+from vggt_motion.bus import codec  # noqa: E402
+from vggt_motion.config import InferenceConfig, VggtConfig, load_config  # noqa: E402
 from vggt_motion.errors import ConfigurationError, InputError, MissingDependencyError, PredictionError  # noqa: E402
 from vggt_motion.geometry import se3  # noqa: E402
-from vggt_motion.inference import vggt  # noqa: E402
+from vggt_motion.inference import task, vggt  # noqa: E402
 from vggt_motion.inference.lattice import fit_width  # noqa: E402
 from vggt_motion.inference.predictor import KeyframeImage, PredictionHints  # noqa: E402
 from vggt_motion.inference.registry import choose_predictor, create_predictor, predictor_names  # noqa: E402
 from vggt_motion.inference.vggt import device as devices  # noqa: E402
 from vggt_motion.inference.vggt import predictor as module  # noqa: E402
 from vggt_motion.inference.vggt.model import Vggt  # noqa: E402
-from vggt_motion.records import ScaleKind, SubmapVerdict  # noqa: E402
+from vggt_motion.records import (  # noqa: E402
+    BlobRef,
+    Event,
+    EventKind,
+    Keyframe,
+    MotionState,
+    PredictTask,
+    RegisterTask,
+    ScaleKind,
+    Segment,
+    SubmapGeometry,
+    SubmapSpec,
+    SubmapVerdict,
+)
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +178,74 @@ class TestPredict:
             create_predictor("vggt", settings(weights))
 
 
+def test_a_submap_that_does_not_fit_fails_with_the_reason_and_is_split(
+    weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the check before the pass, over the failed job, to its two halves, which fit and are registered."""
+    values = {"model": weights, "device": "cpu", "width_px": 140, "memory_reserve_bytes": 0}
+    assignments = ["inference.predictor=vggt", "frontend.overlap_keyframes=2"]
+    config = load_config(assignments=assignments + [f"inference.vggt.{name}={value}" for name, value in values.items()])
+    enough = module.plan_pass(TINY, 6, (84, 140), torch.float32, 2**40, frame_chunk=1).required_bytes
+    monkeypatch.setattr(module, "available_bytes", lambda device: enough)
+    blob = BlobRef("0" * 64, 1, "image/png")
+    taken = [Keyframe("front", 0, i, i * 10**8, MotionState.LINEAR, 320, 200, blob) for i in range(8)]
+    images = {
+        keyframe.keyframe_id: cv2.imencode(".png", image.pixels)[1].tobytes()
+        for keyframe, image in zip(taken, keyframes(8), strict=True)
+    }
+    state = LogState()
+    state.apply(Segment(0, "front", 0, tuple(images), (), (), "budget"))
+    for keyframe in taken:
+        state.apply(keyframe)
+
+    def predicted(job: planner.PlannedJob) -> SubmapGeometry:
+        assert isinstance(job.task, PredictTask)
+        return task.predict_submap(
+            job.task, [images[keyframe.keyframe_id] for keyframe in job.task.keyframes], None, config.inference
+        )[0]
+
+    (whole,) = planner.next_jobs(state, config)
+    with pytest.raises(PredictionError, match="a submap of 8 frames at 140x84 needs about") as caught:
+        predicted(whole)
+    detail = {"job_id": whole.job_id, "reason": str(caught.value)}
+    state.apply(Event(f"job_dead/{whole.job_id}", EventKind.JOB_DEAD, str(caught.value), 0, detail))
+    halves = planner.next_jobs(state, config)
+    geometries = [predicted(job) for job in halves]
+    assert [(geometry.verdict, len(geometry.frames)) for geometry in geometries] == [
+        (SubmapVerdict.GOOD, 4),
+        (SubmapVerdict.GOOD, 6),
+    ]
+    for geometry in geometries:
+        state.apply(geometry)
+    (registration,) = planner.next_jobs(state, config)
+    assert isinstance(registration.task, RegisterTask)
+    assert len(registration.task.shared) == 2
+    task._predictor_of.cache_clear()
+
+
+def test_jobs_together_equal_jobs_one_by_one(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = settings(weights)
+    images = [cv2.imencode(".png", image.pixels)[1].tobytes() for image in keyframes(4)]
+    blob = BlobRef("0" * 64, 1, "image/png")
+    taken = [Keyframe("front", 0, i, i * 10**8, MotionState.LINEAR, 320, 200, blob) for i in range(4)]
+    requests: list[tuple[PredictTask, list[bytes], bytes | None, InferenceConfig]] = []
+    for index, part in enumerate((slice(0, 2), slice(2, 4), slice(0, 3))):
+        spec = SubmapSpec(2 * index, 1, (), tuple(keyframe.keyframe_id for keyframe in taken[part]))
+        requests.append((PredictTask(spec, tuple(taken[part])), images[part], None, config))
+    assert task.load_predictor(config) == ("predictor vggt: chosen by the configuration", 1), "a CPU takes one"
+    together = task.predict_submaps(requests)
+    damaged = task.predict_submaps([requests[0], (requests[1][0], [images[2], b"no image"], None, config)])
+    for outcome, request in zip([*together, damaged[0]], [*requests, requests[0]], strict=True):
+        assert not isinstance(outcome, str)
+        geometry, blobs = outcome
+        alone, its_blobs = task.predict_submap(*request)
+        assert geometry.spec == alone.spec and geometry.verdict is SubmapVerdict.GOOD
+        for mine, other in zip(blobs, its_blobs, strict=True):
+            np.testing.assert_allclose(codec.decode_depth(mine)[0], codec.decode_depth(other)[0], rtol=2e-3)
+    assert damaged[1] == "keyframe front/0/00000003: the image cannot be decoded"
+    task._predictor_of.cache_clear()
+
+
 class TestAgainstReference:
     def test_cameras(self) -> None:
         expected = np.load(fixture_dir("vggt") / "small_expected.npz")
@@ -272,6 +357,14 @@ class TestWhatIsMissingIsSaid:
     def test_weights(self) -> None:
         with pytest.raises(InputError, match=r"no VGGT weights at 'gone.pt'; weights: https"):
             create_predictor("vggt", InferenceConfig(predictor="vggt", vggt=VggtConfig(model="gone.pt")))
+
+    def test_weights_of_something_else(self, tmp_path: Path) -> None:
+        torch.save({"layer.weight": torch.zeros(3)}, tmp_path / "other.pt")
+        with pytest.raises(InputError, match=r"other.pt: not a VGGT checkpoint: .*; weights: https"):
+            create_predictor("vggt", settings(tmp_path / "other.pt"))
+        (tmp_path / "text.pt").write_text("hello\n")
+        with pytest.raises(InputError, match=r"text.pt: it is damaged, incomplete or no checkpoint"):
+            create_predictor("vggt", settings(tmp_path / "text.pt"))
 
     def test_unknown_name(self) -> None:
         with pytest.raises(ConfigurationError, match=r"unknown predictor 'magic': known are sfm, vggt, .*auto"):

@@ -1,7 +1,8 @@
 """The planner: which jobs the log calls for (DESIGN section 4). A pure function; any restart plans the same jobs again.
 
 - a segment closed: predict its submap, once the results that its focal hint folds (submaps 0 to k-3) are known;
-- the focal estimate settled: predict submaps that it contradicts once more, as revision 2;
+- the focal estimate settled: predict submaps that it contradicts once more, as revision 2 (this, and the waiting for
+  results, only with a predictor that takes a focal hint);
 - a submap came out badly: predict it once more, as revision 2, with the settled estimate and in a wider view;
 - a submap cannot be predicted (its job is dead): predict the two halves of its base, which overlap; where a half is
   dead too, the graph breaks;
@@ -18,6 +19,7 @@ from vggt_motion.backend import focal
 from vggt_motion.backend.state import LogState
 from vggt_motion.config import Config
 from vggt_motion.inference.given import given_hint, is_given
+from vggt_motion.inference.registry import takes_focal_hints
 from vggt_motion.records import (
     Constraint,
     ConstraintKind,
@@ -142,11 +144,17 @@ def _quality(state: LogState, composition: _Composition) -> SubmapQuality | None
     return geometry.quality if geometry is not None else None
 
 
+def _is_focal_estimated(config: Config) -> bool:
+    """Whether submaps are predicted with what earlier ones found of the focal length."""
+    return not is_given(config.inference) and takes_focal_hints(config.inference.predictor)
+
+
 def _predictions(state: LogState, config: Config) -> Iterator[PlannedJob]:
+    is_estimated = _is_focal_estimated(config)
     estimate = focal.FocalEstimate()
     for index in sorted(state.segments):
         newest = index - HINT_LAG
-        if not is_given(config.inference) and newest >= 0:
+        if is_estimated and newest >= 0:
             # Only wholes are folded: nobody waits for the halves of a submap that cannot be predicted.
             whole = _whole(state.segments[newest])
             if not _is_resolved(state, whole, 1):
@@ -167,12 +175,13 @@ def _second_predictions(state: LogState, config: Config) -> dict[_Composition, F
 
     Those that came out badly, and those whose focal length the estimate contradicts at the moment that it settled.
     """
-    decision = _settled_estimate(state) if not is_given(config.inference) else None
+    is_estimated = _is_focal_estimated(config)
+    decision = _settled_estimate(state) if is_estimated else None
     hint = decision[1] if decision is not None else None
     again: dict[_Composition, FocalHint | None] = {}
     for composition in _all_compositions(state, config):
         geometry = _geometry(state, composition, 1)
-        if geometry is None or (decision is None and not is_given(config.inference)):
+        if geometry is None or (decision is None and is_estimated):
             continue
         if geometry.verdict in _BAD and _wider(state, composition) is not composition:
             again[composition] = hint

@@ -186,15 +186,17 @@ def shrink_mask(mask: npt.NDArray[np.bool_], width_px: int, height_px: int) -> n
 
 
 def _quality(focal_over_width: npt.NDArray[np.float64]) -> SubmapQuality:
-    """What a network tells of itself: the focal length and how far its frames, one camera, disagree on it."""
+    """What a network tells of itself: its focal length, the median over its frames, and not how well it knows it.
+
+    How far its frames differ says nothing of the error that they have in common, so no sigma is claimed; without one
+    the focal length stays out of the session's running estimate, of which a network could make no use.
+    """
     nan = float("nan")
-    median = float(np.median(focal_over_width))
-    spread = 1.4826 * float(np.median(np.abs(focal_over_width - median))) / median if len(focal_over_width) > 1 else nan
     return SubmapQuality(
         registered_frame_count=len(focal_over_width),
         mean_reprojection_error_px=nan,
         track_inlier_ratio=nan,
         median_parallax_deg=nan,
-        focal_over_width=median,
-        focal_relative_sigma=spread,
+        focal_over_width=float(np.median(focal_over_width)),
+        focal_relative_sigma=nan,
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -76,4 +76,17 @@ class Predictor(Protocol):
         Never raises for hard input: a submap that cannot be solved comes back with verdict FAILED or ROTATION_ONLY and
         a reason.
         """
+        ...
+
+
+@runtime_checkable
+class BatchPredictor(Predictor, Protocol):
+    """A predictor that is faster on several submaps at a time, as a large GPU is."""
+
+    batch_limit: int  # submaps that are worth predicting together at most; 1 = none
+
+    def predict_many(
+        self, requests: Sequence[tuple[Sequence[KeyframeImage], PredictionHints]]
+    ) -> tuple[Prediction, ...]:
+        """Predict several submaps; each result is that of :meth:`predict` up to rounding."""
         ...

@@ -20,11 +20,18 @@ _REGISTRY: dict[str, str] = {
     "recorded": "vggt_motion.inference.recorded:create",
 }
 AUTO = "auto"
+# The networks have no input for a focal length. "auto" may be "sfm" on the machine of one worker or another.
+_TAKING_FOCAL_HINTS = frozenset({"sfm", "recorded", AUTO})
 
 
 def predictor_names() -> tuple[str, ...]:
     """Names that the configuration accepts for ``inference.predictor``."""
     return (*_REGISTRY, AUTO)
+
+
+def takes_focal_hints(name: str) -> bool:
+    """Whether a predictor of that name makes use of what is known of the focal length."""
+    return name in _TAKING_FOCAL_HINTS
 
 
 def choose_predictor(config: InferenceConfig) -> tuple[str, str]:

@@ -6,7 +6,7 @@ from vggt_motion.bus import codec
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.bus.worker import BlobCache, Computation, work
 from vggt_motion.config import Config
-from vggt_motion.inference.task import load_predictor, predict_submap
+from vggt_motion.inference.task import load_predictor, predict_submap, predict_submaps
 from vggt_motion.records import JobKind, Lease, PredictTask, Stream
 
 
@@ -26,7 +26,12 @@ def _serve(context: ServiceContext) -> None:
         blobs = cache.fetch(refs)
         images = blobs[: len(task.keyframes)]
         arguments = (task, images, blobs[-1] if mask is not None else None, inference)
-        return Computation(predict_submap, arguments, detail=f"submap {task.spec.submap_index} r{task.spec.revision}")
+        return Computation(
+            predict_submap,
+            arguments,
+            detail=f"submap {task.spec.submap_index} r{task.spec.revision}",
+            of_several=predict_submaps,
+        )
 
     work(
         context,
@@ -36,4 +41,5 @@ def _serve(context: ServiceContext) -> None:
         prepare=prepare,
         deadline_s=inference.job_deadline_s,
         warm_up=Computation(load_predictor, (inference,), detail=f"loading predictor {inference.predictor}"),
+        warm_up_deadline_s=inference.load_deadline_s,
     )

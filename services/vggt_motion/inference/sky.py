@@ -19,7 +19,14 @@ import numpy.typing as npt
 
 from vggt_motion.config import SkyConfig
 from vggt_motion.errors import InputError, MissingDependencyError, PredictionError
-from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints, Predictor
+from vggt_motion.inference.predictor import (
+    BatchPredictor,
+    KeyframeImage,
+    PredictedFrame,
+    Prediction,
+    PredictionHints,
+    Predictor,
+)
 
 _SIDE_PX = 320
 _IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
@@ -121,10 +128,24 @@ class SkyMasking:
         self.name = predictor.name
         self._predictor = predictor
         self._segmenter = segmenter
+        self.batch_limit = predictor.batch_limit if isinstance(predictor, BatchPredictor) else 1
 
     def predict(self, images: Sequence[KeyframeImage], hints: PredictionHints) -> Prediction:
         """Predict and mask; see the contract."""
-        prediction = self._predictor.predict(images, hints)
+        return self._without_sky(self._predictor.predict(images, hints), images)
+
+    def predict_many(
+        self, requests: Sequence[tuple[Sequence[KeyframeImage], PredictionHints]]
+    ) -> tuple[Prediction, ...]:
+        """Predict and mask several submaps; see the contract."""
+        if not isinstance(self._predictor, BatchPredictor):
+            return tuple(self.predict(images, hints) for images, hints in requests)
+        predictions = self._predictor.predict_many(requests)
+        return tuple(
+            self._without_sky(prediction, images) for prediction, (images, _) in zip(predictions, requests, strict=True)
+        )
+
+    def _without_sky(self, prediction: Prediction, images: Sequence[KeyframeImage]) -> Prediction:
         frames = tuple(self._masked(frame, images[frame.position]) for frame in prediction.frames)
         return replace(prediction, frames=frames)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
 from collections.abc import Sequence
 from functools import lru_cache
@@ -15,10 +16,17 @@ from vggt_motion.bus.depth import encode_depth
 from vggt_motion.config import InferenceConfig
 from vggt_motion.errors import PredictionError
 from vggt_motion.geometry import se3
-from vggt_motion.inference.predictor import KeyframeImage, PredictionHints, Predictor
-from vggt_motion.inference.registry import create_predictor
+from vggt_motion.inference.predictor import (
+    BatchPredictor,
+    KeyframeImage,
+    Prediction,
+    PredictionHints,
+    Predictor,
+)
+from vggt_motion.inference.registry import choose_predictor, create_predictor
 from vggt_motion.records import BlobRef, FrameGeometry, PredictTask, SubmapGeometry
 
+_log = logging.getLogger(__name__)
 DEPTH_MEDIA_TYPE = "application/vnd.vggt-motion.depth"
 
 
@@ -39,6 +47,47 @@ def predict_submap(
     Raises:
         PredictionError: an image cannot be decoded, or the images differ in size.
     """
+    decoded, hints, decode_seconds = _decoded(task, images, ego_mask)
+    prediction = _predictor(config).predict(decoded, hints)
+    return _encoded(task, prediction, decode_seconds)
+
+
+def predict_submaps(
+    requests: Sequence[tuple[PredictTask, Sequence[bytes], bytes | None, InferenceConfig]],
+) -> list[tuple[SubmapGeometry, tuple[bytes, ...]] | str]:
+    """Several jobs of one configuration together, as :func:`predict_submap` does one by one.
+
+    Returns:
+        For each the same as :func:`predict_submap`, or the reason why it failed.
+    """
+    predictor = _predictor(requests[0][3])
+    try:
+        if not isinstance(predictor, BatchPredictor):
+            raise PredictionError(f"the predictor {predictor.name} takes one submap at a time")
+        decoded = [_decoded(task, images, ego_mask) for task, images, ego_mask, _ in requests]
+        predictions = predictor.predict_many([(images, hints) for images, hints, _ in decoded])
+    except PredictionError as error:
+        _log.info("predicting one by one", extra={"reason": str(error)})
+        return [_outcome(*request) for request in requests]
+    return [
+        _encoded(task, prediction, seconds)
+        for (task, *_), prediction, (*_, seconds) in zip(requests, predictions, decoded, strict=True)
+    ]
+
+
+def _outcome(
+    task: PredictTask, images: Sequence[bytes], ego_mask: bytes | None, config: InferenceConfig
+) -> tuple[SubmapGeometry, tuple[bytes, ...]] | str:
+    try:
+        return predict_submap(task, images, ego_mask, config)
+    except PredictionError as error:
+        return str(error)
+
+
+def _decoded(
+    task: PredictTask, images: Sequence[bytes], ego_mask: bytes | None
+) -> tuple[list[KeyframeImage], PredictionHints, float]:
+    """Images and hints of a task, and the seconds that decoding took."""
     begin = time.perf_counter()
     decoded = [
         KeyframeImage(keyframe.keyframe_id, keyframe.capture_time_ns, _decode_rgb(image, keyframe.keyframe_id))
@@ -54,8 +103,12 @@ def predict_submap(
         zero_motion_copies={position[copy]: position[original] for copy, original in task.spec.zero_motion_copies},
         loop_positions=frozenset(position[keyframe_id] for keyframe_id in task.spec.loop_keyframe_ids),
     )
-    decode_seconds = time.perf_counter() - begin
-    prediction = _predictor(config).predict(decoded, hints)
+    return decoded, hints, time.perf_counter() - begin
+
+
+def _encoded(
+    task: PredictTask, prediction: Prediction, decode_seconds: float
+) -> tuple[SubmapGeometry, tuple[bytes, ...]]:
     begin = time.perf_counter()
     # The submap's frame is that of its first camera, whatever the predictor chose: so the world begins there too.
     submap_from_predicted = se3.inverse(prediction.frames[0].submap_from_camera) if prediction.frames else np.eye(4)
@@ -82,14 +135,20 @@ def predict_submap(
     return geometry, tuple(blobs)
 
 
-def load_predictor(config: InferenceConfig) -> None:
+def load_predictor(config: InferenceConfig) -> tuple[str, int]:
     """Import and build the predictor in this process, so that what is missing is said before the first job.
+
+    Returns:
+        Which predictor it is and why, in one line: with ``auto`` each worker chooses for its own machine; and the
+        number of submaps that it takes together at most.
 
     Raises:
         ConfigurationError: the predictor is unknown.
         MissingDependencyError: its packages or weights are absent.
     """
-    _predictor(config)
+    predictor = _predictor(config)
+    batch = predictor.batch_limit if isinstance(predictor, BatchPredictor) else 1
+    return f"predictor {predictor.name}: {config.predictor_reason or choose_predictor(config)[1]}", batch
 
 
 @lru_cache(maxsize=1)

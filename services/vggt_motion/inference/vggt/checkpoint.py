@@ -19,17 +19,19 @@ from torch import Tensor
 from vggt_motion.errors import InputError, MissingDependencyError
 from vggt_motion.inference.vggt.architecture import VggtArchitecture, architecture_of
 from vggt_motion.inference.vggt.layers import ACCELERATOR_ROW_CHUNK, CPU_ROW_CHUNK
+from vggt_motion.inference.vggt.mapped import FileMapping, give_back_after_use, mapping_of
 from vggt_motion.inference.vggt.model import Vggt
 
 _log = logging.getLogger(__name__)
 _TRACKING = "track_head."
-_POINTS = "point_head."
+_DEPTH = "depth_head."
 _WRAPPERS = ("model", "state_dict")
 # Matrix products of the transformer run in the inference dtype. Its norms, tokens and scales stay in float32, and so do
 # both heads: with the camera head in bfloat16 the fields of view move by 0.4 % on the reference images, five times what
 # the transformer's own rounding does to them, and a depth map is an exponential of its head's output.
 _REDUCED = re.compile(r"^aggregator\..*\b(qkv|proj|fc1|fc2)\.(weight|bias)$")
 _LISTED_NAMES = 12
+_LONGEST_REASON = 160  # characters
 
 
 class CheckpointError(InputError):
@@ -51,7 +53,7 @@ class CheckpointError(InputError):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """An open checkpoint: shapes of all parameters, and their values one by one."""
+    """An open checkpoint: shapes of all parameters, and their values one by one, which may lie in the mapped file."""
 
     path: Path
     shapes: Mapping[str, tuple[int, ...]]
@@ -80,7 +82,9 @@ def open_checkpoint(path: Path) -> Checkpoint:
         raise
     # Readers of damaged files raise whatever they stumble over.
     except Exception as error:
-        raise InputError(f"cannot read checkpoint {path.name}: {_first_line(error)}") from error
+        raise InputError(
+            f"cannot read checkpoint {path.name}: it is damaged, incomplete or no checkpoint ({_first_line(error)})"
+        ) from error
 
 
 def inference_dtype(name: str, dtype: torch.dtype) -> torch.dtype:
@@ -88,11 +92,23 @@ def inference_dtype(name: str, dtype: torch.dtype) -> torch.dtype:
     return dtype if _REDUCED.match(name) else torch.float32
 
 
-def weight_bytes(architecture: VggtArchitecture, dtype: torch.dtype, *, with_points: bool = False) -> int:
-    """Memory of the network's parameters as :func:`load_model` keeps them."""
+def copied_bytes(
+    checkpoint: Checkpoint, architecture: VggtArchitecture, dtype: torch.dtype, device: torch.device
+) -> int:
+    """Memory that :func:`load_model` takes on ``device``: of the parameters that cannot stay in the file."""
     with torch.device("meta"):
-        state = Vggt(architecture, with_points=with_points).state_dict()
-    return sum(math.prod(value.shape) * inference_dtype(name, dtype).itemsize for name, value in state.items())
+        wanted = Vggt(architecture).state_dict()
+    mapping = mapping_of(checkpoint.path) if device.type == "cpu" else FileMapping(())
+    total = 0
+    for name, parameter in wanted.items():
+        kept = inference_dtype(name, dtype)
+        # The depth head is laid out anew.
+        if not name.startswith(_DEPTH) and name in checkpoint.shapes:
+            value = checkpoint.read(name)
+            if value.dtype == kept and mapping.holds(value):
+                continue
+        total += math.prod(parameter.shape) * kept.itemsize
+    return total
 
 
 def load_model(
@@ -104,6 +120,9 @@ def load_model(
     dense_levels: tuple[int, ...] | None = None,
 ) -> Vggt:
     """Build the network that a checkpoint describes and fill it.
+
+    On a CPU, parameters that are used as they are in the checkpoint stay in the file (see :mod:`.mapped`): it must not
+    be overwritten while the network is in use.
 
     Args:
         checkpoint: from :func:`open_checkpoint`.
@@ -129,6 +148,7 @@ def load_model(
     if missing or unexpected or misshapen:
         raise CheckpointError(checkpoint.path, missing, unexpected, misshapen)
     state: dict[str, Tensor] = {}
+    mapping = mapping_of(checkpoint.path)
     for name in wanted:
         value = checkpoint.read(name)
         if not value.dtype.is_floating_point:
@@ -136,9 +156,13 @@ def load_model(
                 f"cannot read checkpoint {checkpoint.path.name}: {name} is {value.dtype}, not floating-point"
             )
         state[name] = value.detach().to(device=device, dtype=inference_dtype(name, dtype))
+        if not mapping.holds(state[name]):
+            mapping.give_back([value])  # it has been copied
     model.load_state_dict(state, strict=True, assign=True)
     model.set_row_chunk(CPU_ROW_CHUNK if device.type == "cpu" else ACCELERATOR_ROW_CHUNK)
     model.depth_head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    mapping.give_back(state.values())  # what was laid out anew
+    give_back_after_use(model, mapping)
     return model.eval().requires_grad_(False)
 
 
@@ -166,4 +190,5 @@ def _listed(names: tuple[str, ...]) -> str:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    line = (str(error).strip().splitlines() or [""])[0]
+    return f"{type(error).__name__}: {line}"[:_LONGEST_REASON]

@@ -147,8 +147,10 @@ def _group_available(proc: Path, cgroup: Path) -> list[int]:
             if limit != "max":
                 used = int((directory / "memory.current").read_text())
                 statistics = (directory / "memory.stat").read_text().splitlines()
-                # File pages are counted as used but given back on demand.
-                reclaimable = sum(int(line.split()[1]) for line in statistics if line.startswith("inactive_file "))
+                # File pages, a checkpoint's among them, are counted as used but given back on demand.
+                reclaimable = sum(
+                    int(line.split()[1]) for line in statistics if line.startswith(("inactive_file ", "active_file "))
+                )
                 found.append(max(int(limit) - used + reclaimable, 0))
         except (OSError, ValueError, IndexError):
             pass

@@ -63,8 +63,14 @@ class Vggt(nn.Module):
         Args:
             images: (B, S, 3, H, W) RGB in [0, 1], sides divisible by 14.
             frame_chunk: frames that dense heads take at a time: it bounds the memory and does not change the result.
+
+        Raises:
+            ValueError: a side is not divisible by the patch.
         """
         batch, frames, _, height, width = images.shape
+        patch = self.architecture.patch_px
+        if height % patch or width % patch:
+            raise ValueError(f"images of {width}x{height}: both sides must be divisible by {patch}")
         stopwatch = Stopwatch(images.device)
         heads = [self.depth_head, self.point_head] if self.with_points else [self.depth_head]
         maps: list[list[Tensor]] = [[] for _ in heads]

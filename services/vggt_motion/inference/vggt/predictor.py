@@ -15,17 +15,17 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from vggt_motion.config import VggtConfig
-from vggt_motion.errors import PredictionError
+from vggt_motion.errors import InputError, PredictionError
 from vggt_motion.geometry import se3
 from vggt_motion.inference import lattice as lattices
 from vggt_motion.inference.lattice import Lattice
 from vggt_motion.inference.predictor import KeyframeImage, Prediction, PredictionHints
 from vggt_motion.inference.vggt.architecture import architecture_of
-from vggt_motion.inference.vggt.checkpoint import load_model, open_checkpoint, weight_bytes
+from vggt_motion.inference.vggt.checkpoint import copied_bytes, load_model, open_checkpoint
 from vggt_motion.inference.vggt.device import resolve_device, resolve_dtype
 from vggt_motion.inference.vggt.memory import MemoryPlan, available_bytes, is_out_of_memory, plan_pass
 from vggt_motion.inference.vggt.model import Vggt, VggtOutput
-from vggt_motion.inference.vggt.weights import fetch_weights
+from vggt_motion.inference.vggt.weights import WHERE_TO_GET, fetch_weights
 from vggt_motion.records import ScaleKind
 
 _log = logging.getLogger(__name__)
@@ -45,8 +45,12 @@ def load(config: VggtConfig) -> VggtPredictor:
     dtype = resolve_dtype(config.dtype, device)
     path = fetch_weights(config.model, allow_download=config.allow_download)
     checkpoint = open_checkpoint(path)
-    architecture = architecture_of(checkpoint.shapes, config.dense_levels)
-    required, available = weight_bytes(architecture, dtype), available_bytes(device) - config.memory_reserve_bytes
+    try:
+        architecture = architecture_of(checkpoint.shapes, config.dense_levels)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}; {WHERE_TO_GET}") from error
+    required = copied_bytes(checkpoint, architecture, dtype, device)
+    available = available_bytes(device) - config.memory_reserve_bytes
     if required > available:
         raise PredictionError(
             f"VGGT weights {path.name} need {required / 2**30:.1f} GiB as {_name(dtype)} and "
@@ -68,6 +72,7 @@ class VggtPredictor:
         """Take a model that is already on its device; ``label`` names its weights in results."""
         self._model = model
         self._config = config
+        self.batch_limit = config.max_batch_submaps if device.type != "cpu" else 1  # a CPU is full with one
         self._dtype = dtype
         self._device = device
         self._label = f"vggt {label} {_name(dtype)}"
