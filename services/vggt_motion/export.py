@@ -19,9 +19,9 @@ from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, compose
 from vggt_motion.bus import codec
 from vggt_motion.bus.log import RECORD_OF_STREAM
 from vggt_motion.config import Config
-from vggt_motion.errors import InputError, LedgerError
+from vggt_motion.errors import InputError, LedgerError, RequestRefusedError
 from vggt_motion.evaluation.trajectory_io import to_csv, to_json, to_kitti, to_tum
-from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME
+from vggt_motion.ledger.directory import DATABASE_NAME, stored_blob
 from vggt_motion.ledger.sqlite import read_only
 from vggt_motion.ledger.store import sha256_hex
 from vggt_motion.records import BlobRef, GraphUpdate
@@ -65,7 +65,7 @@ class StoredSession:
             LedgerError: there is no ledger, or it is damaged.
             CodecError: a record is none.
         """
-        self._blobs = directory / BLOBS_NAME
+        self._directory = directory
         self.state = LogState()
         with read_only(directory / DATABASE_NAME) as reader:
             for stream, record_type in RECORD_OF_STREAM.items():
@@ -82,9 +82,9 @@ class StoredSession:
             LedgerError: it is not there, or damaged.
         """
         try:
-            data = (self._blobs / ref.sha256).read_bytes()
-        except OSError as error:
-            raise LedgerError(f"cannot read blob {ref.sha256}: {error.strerror or error}") from error
+            data = stored_blob(self._directory, ref.sha256)
+        except RequestRefusedError as error:
+            raise LedgerError(str(error)) from error
         if sha256_hex(data) != ref.sha256:
             raise LedgerError(f"blob {ref.sha256} is damaged")
         return data
