@@ -229,3 +229,17 @@ def test_a_subscription_that_is_closed_while_it_is_full_leaves_nothing_blocked(e
         is_over.set()
         feeder.join(60)
         assert not feeder.is_alive()
+
+
+def test_a_watch_begins_among_more_services_than_fit_a_channel_of_messages(endpoint: str) -> None:
+    names = {f"worker-{number}" for number in range(300)}
+    with connect(endpoint) as fleet, connect(endpoint) as watcher, connect(endpoint) as asker:
+        for name in names:
+            fleet.declare_token(fleet.keys.alive("inference", name))
+        seen: dict[str, bool] = {}
+        watcher.watch_liveliness(watcher.keys.all_alive(), lambda key, is_alive: seen.update({key: is_alive}))
+        watcher.serve(watcher.keys.rpc("ledger", "status"), lambda _, payload: payload)
+        wait_until(lambda: {key.rsplit("/", 1)[1] for key, is_alive in seen.items() if is_alive} >= names)
+        assert asker.request(asker.keys.rpc("ledger", "status"), b"there") == b"there"
+        fleet.close()
+        wait_until(lambda: not any(is_alive for key, is_alive in seen.items() if key.rsplit("/", 1)[1] in names))

@@ -21,6 +21,9 @@ _FIFO_CAPACITY = 8  # the default of 256 messages would be a gigabyte of images
 # publisher stands still with it. So what a publisher keeps must fit, with room for what is published meanwhile.
 MAX_HISTORY = 64
 _HISTORY_FIFO_CAPACITY = 4 * MAX_HISTORY
+# Likewise every token that is there when a watch is declared: with room for 8, a ledger that came back among nine
+# services now and then never got past its declaration. Tokens are a few bytes; no fleet is larger than this.
+_TOKEN_FIFO_CAPACITY = 2**16
 _LATEST_CAPACITY = 1
 # Recovery asks the publishers; their heartbeats alone bring nothing back after a restart of the router (Zenoh 1.10).
 _RECOVERY_INTERVAL = timedelta(seconds=1)
@@ -173,7 +176,7 @@ class LivelinessSubscription:
     def __init__(self, session: zenoh.Session, key: str, callback: Callable[[str, bool], None]) -> None:
         self.is_closed = False
         self._callback = callback
-        channel: Any = handlers.FifoChannel(_FIFO_CAPACITY)
+        channel: Any = handlers.FifoChannel(_TOKEN_FIFO_CAPACITY)
         self._subscriber: Any = session.liveliness().declare_subscriber(key, channel, history=True)
         self._handler = self._subscriber.handler
         self._thread = threading.Thread(target=self._drain, name=f"drain {key}", daemon=True)
