@@ -30,7 +30,8 @@ _Pointer = ctypes.c_void_p
 _Write = ctypes.CFUNCTYPE(ctypes.c_int, _Pointer, _Pointer, ctypes.c_int, ctypes.c_int64)
 _Truncate = ctypes.CFUNCTYPE(ctypes.c_int, _Pointer, ctypes.c_int64)
 _Sync = ctypes.CFUNCTYPE(ctypes.c_int, _Pointer, ctypes.c_int)
-_Open = ctypes.CFUNCTYPE(ctypes.c_int, _Pointer, ctypes.c_char_p, _Pointer, ctypes.c_int, _Pointer)
+# The name as a pointer: SQLite keeps it until the file is closed (sqlite3_vfs.xOpen), a copy in Python is gone by then.
+_Open = ctypes.CFUNCTYPE(ctypes.c_int, _Pointer, _Pointer, _Pointer, ctypes.c_int, _Pointer)
 _Delete = ctypes.CFUNCTYPE(ctypes.c_int, _Pointer, ctypes.c_char_p, ctypes.c_int)
 
 
@@ -188,9 +189,9 @@ class DiskLog:
         vfs = library.sqlite3_vfs_find(None).contents
         real_open, real_delete = _Open.from_buffer_copy(vfs.open), _Delete.from_buffer_copy(vfs.delete)
 
-        def opened(self_: int, name: bytes | None, file: int, flags: int, out_flags: int) -> int:
+        def opened(self_: int, name: int | None, file: int, flags: int, out_flags: int) -> int:
             code = int(real_open(self_, name, file, flags, out_flags))
-            path = None if name is None else self.relative(os.fsdecode(name))
+            path = None if name is None else self.relative(os.fsdecode(ctypes.string_at(name)))
             if code == 0 and path is not None:
                 self._hook_file(file, path)
             return code
