@@ -7,7 +7,7 @@ MPEG-1/2, MPEG-4 part 2 and Motion JPEG; packets of other codecs say nothing her
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 
 Size = tuple[int, int]  # width, height in pixels
 
@@ -69,16 +69,24 @@ class _Bits:
 
 def _h264(packet: bytes) -> Size | None:
     """Sequence parameter set in Annex B form (ITU-T H.264, 7.3.2.1.1)."""
+    bits = _parameter_set(packet, lambda header: header & 0x1F, pictures=(1, 5), wanted=7, header_bytes=1)
+    return None if bits is None else _h264_size(bits)
+
+
+def _parameter_set(
+    packet: bytes, kind_of: Callable[[int], int], *, pictures: Container[int], wanted: int, header_bytes: int
+) -> _Bits | None:
+    """Content of the first unit of a kind in Annex B form, unless a picture comes first: what announces it is ahead."""
     begin = packet.find(_START)
     while begin >= 0:
         unit = begin + len(_START)
-        kind = packet[unit] & 0x1F
-        if kind in (1, 5):
-            return None  # a picture: what announces it comes before
+        kind = kind_of(packet[unit])
+        if kind in pictures:
+            return None
         following = packet.find(_START, unit)
-        if kind == 7:
+        if kind == wanted:
             end = len(packet) if following < 0 else following
-            return _h264_size(_Bits(packet[unit + 1 : end].replace(b"\0\0\3", b"\0\0")))
+            return _Bits(packet[unit + header_bytes : end].replace(b"\0\0\3", b"\0\0"))
         begin = following
     return None
 
@@ -137,18 +145,8 @@ def _skip_scaling_list(bits: _Bits, size: int) -> None:
 
 def _hevc(packet: bytes) -> Size | None:
     """Sequence parameter set in Annex B form (ITU-T H.265, 7.3.2.2)."""
-    begin = packet.find(_START)
-    while begin >= 0:
-        unit = begin + len(_START)
-        kind = (packet[unit] >> 1) & 0x3F
-        if kind < 32:
-            return None  # a picture: what announces it comes before
-        following = packet.find(_START, unit)
-        if kind == 33:
-            end = len(packet) if following < 0 else following
-            return _hevc_size(_Bits(packet[unit + 2 : end].replace(b"\0\0\3", b"\0\0")))
-        begin = following
-    return None
+    bits = _parameter_set(packet, lambda header: (header >> 1) & 0x3F, pictures=range(32), wanted=33, header_bytes=2)
+    return None if bits is None else _hevc_size(bits)
 
 
 def _hevc_size(bits: _Bits) -> Size:
