@@ -109,7 +109,7 @@ def test_reduced_system_equals_the_schur_complement_of_the_dense_one() -> None:
     back = np.linalg.solve(hessian[head:, head:], np.column_stack([hessian[head:, :head], gradient[head:]]))
     expected = hessian[:head, :head] - hessian[:head, head:] @ back[:, :head]
     expected_right = gradient[:head] - hessian[:head, head:] @ back[:, head]
-    system, right, _, _ = bundle._reduce(
+    system, right, _, _, _ = bundle._reduce(
         scene.rotations, scene.translations, scene.points, scene.shared, observations.start, observations.frame,
         observations.pixel, 2.0, 0.0, np.ones(4, dtype=bool), np.zeros(4), np.zeros(4), np.zeros(3), np.zeros(3),
         np.array([-1, 0, 1, 2]),

@@ -95,14 +95,16 @@ class _Recorder:
         }
         self._views.start()
         try:
-            next_report = 0.0
+            next_report, was_complete = 0.0, False
             while not context.stopping.is_set():
                 count = self._follow(followers)
                 self._fill_keyframes()
                 self._check()
-                if time.monotonic() >= next_report:
-                    next_report = time.monotonic() + _REPORT_S
-                    self._report()
+                is_complete = self._is_complete
+                if time.monotonic() >= next_report or is_complete != was_complete:
+                    next_report, was_complete = time.monotonic() + _REPORT_S, is_complete
+                    # a change of state is sent at once: whoever waits for the recording waits no longer than it takes
+                    self._report("idle" if is_complete else "working")
                 if count == 0:
                     context.stopping.wait(_POLL_S)
             self._follow(followers, keep_going=False)
@@ -277,7 +279,13 @@ class _Recorder:
         if failure is not None:
             raise failure
 
-    def _report(self, state: str = "working") -> None:
+    @property
+    def _is_complete(self) -> bool:
+        """Whether the final graph is in the file, with all that was there before it and what it looks like."""
+        graph = self._log.latest_graph()
+        return graph is not None and graph.is_final and not self._pending_keyframes and self._views.is_done
+
+    def _report(self, state: str) -> None:
         recording = self._recording
         pending = len(self._pending_keyframes)
         missing = sum(self._expected_frames.values()) - recording.frame_count

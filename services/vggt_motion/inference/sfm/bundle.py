@@ -126,7 +126,7 @@ def adjust(
     centre = -rotations[fixed_frame].T @ translations[fixed_frame]
     cost = _cost(rotations, translations, points, shared, observations, robust_px, mean, information)
     for _ in range(max_iterations):
-        system, gradient, elimination, point_step = _reduce(
+        system, gradient, elimination, shared_elimination, point_step = _reduce(
             rotations, translations, points, shared, observations.start, observations.frame, observations.pixel,
             robust_px, damping, free, mean, information, axis, centre, slot,
         )  # fmt: skip
@@ -137,8 +137,9 @@ def adjust(
                 break
             continue
         moved_points = _back_substitute(
-            points, step, observations.start, observations.frame, elimination, point_step, axis, centre, slot
-        )
+            points, step, observations.start, observations.frame, elimination, shared_elimination, point_step,
+            axis, centre, slot,
+        )  # fmt: skip
         moved_rotations, moved_translations = _move_cameras(rotations, translations, step, axis, centre, slot)
         moved_shared = shared + step[-_SHARED:]
         moved_cost = _cost(
@@ -174,7 +175,7 @@ def shared_information(
     free = np.array(calibration.free)
     nothing = np.zeros(_SHARED)
     slot = _slots(observations, len(scene.rotations), fixed_frame)
-    system, _, _, _ = _reduce(
+    system, _, _, _, _ = _reduce(
         scene.rotations, scene.translations, scene.points, shared, observations.start, observations.frame,
         observations.pixel, robust_px, 1e-9, free, nothing, nothing, np.zeros(3), np.zeros(3), slot,
     )  # fmt: skip
@@ -291,10 +292,14 @@ def _reduce(  # type: ignore[no-untyped-def]
 ):
     """Reduced camera system and its right hand side.
 
-    Unknowns: six of each camera that has a slot, in the order of frames, then the shared ones. Also returns, per
-    observation, the (10, 3) rows ``W V^-1`` (camera, then its share of the shared rows) and, per point, ``V^-1 g``, for
-    the back substitution. A change of the logarithm of the focal length by ``s`` is meant to stretch the scene by
-    ``exp(s)`` along ``axis`` (zero: not at all) about ``centre``.
+    Unknowns: six of each camera that has a slot, in the order of frames, then the shared ones. Also returns what the
+    back substitution needs: rows ``W V^-1`` of the camera of each observation (O, 6, 3) and of the shared camera per
+    point (P, 4, 3), and ``V^-1 g`` per point (P, 3). A change of the logarithm of the focal length by ``s`` is meant to
+    stretch the scene by ``exp(s)`` along ``axis`` (zero: not at all) about ``centre``.
+
+    All derivatives of an observation follow from the two rows ``along`` by the point in the camera: the translation
+    moves it as it is, the rotation through the cross product with the turned point ``R X``, the point through ``R``. So
+    their products follow from the one matrix ``along^T along``.
     """
     size = _DIMENSIONS_OF_CAMERA * (slot.max() + 1) + _SHARED
     base = size - _SHARED
@@ -302,153 +307,216 @@ def _reduce(  # type: ignore[no-untyped-def]
     width = robust_px * robust_px
     system = np.zeros((size, size))
     right = np.zeros(size)
-    elimination = np.zeros((len(frame), 6 + _SHARED, 3))
+    elimination = np.zeros((len(frame), 6, 3))
+    shared_elimination = np.zeros((len(points), _SHARED, 3))
     point_step = np.zeros((len(points), 3))
-    jacobian = np.zeros((2, 6 + _SHARED))
-    jacobian[0, 8] = 1.0 if free[2] else 0.0
-    jacobian[1, 9] = 1.0 if free[3] else 0.0
-    on_point = np.zeros((2, 3))
-    along = np.zeros((2, 3))
+    any_free = free[0] or free[1] or free[2] or free[3]
     longest = 0
     for p in range(len(start) - 1):
         longest = max(longest, start[p + 1] - start[p])
-    coupling = np.zeros((longest, 6, 3))
+    # per observation of the point: the slot of its camera, its row, and the six rows of its coupling by column
+    slots, rows = np.zeros(longest, dtype=np.int64), np.zeros(longest, dtype=np.int64)
+    c0, c1, c2 = np.zeros(6 * longest), np.zeros(6 * longest), np.zeros(6 * longest)
+    p0, p1, p2 = np.zeros(6 * longest), np.zeros(6 * longest), np.zeros(6 * longest)
     shared_coupling = np.zeros((_SHARED, 3))
-    product = np.zeros((longest, 6, 3))
-    shared_product = np.zeros((_SHARED, 3))
+    on_shared = np.zeros((_SHARED, 2))  # derivative of the pixel
+    q = np.zeros((_SHARED, 3))
     for p in range(len(start) - 1):
         first, last = start[p], start[p + 1]
         if first == last:
             continue
-        v = np.zeros((3, 3))
-        g = np.zeros(3)
+        v00 = v01 = v02 = v11 = v12 = v22 = g0 = g1 = g2 = 0.0
         shared_coupling[:] = 0.0
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        used = 0
         for o in range(first, last):
-            m = o - first
-            coupling[m] = 0.0
-            r, t = rotations[frame[o]], translations[frame[o]]
-            rx = r[0, 0] * points[p, 0] + r[0, 1] * points[p, 1] + r[0, 2] * points[p, 2]
-            ry = r[1, 0] * points[p, 0] + r[1, 1] * points[p, 1] + r[1, 2] * points[p, 2]
-            rz = r[2, 0] * points[p, 0] + r[2, 1] * points[p, 1] + r[2, 2] * points[p, 2]
-            z = rz + t[2]
-            if z <= _MIN_DEPTH:
+            f = frame[o]
+            r00, r01, r02 = rotations[f, 0, 0], rotations[f, 0, 1], rotations[f, 0, 2]
+            r10, r11, r12 = rotations[f, 1, 0], rotations[f, 1, 1], rotations[f, 1, 2]
+            r20, r21, r22 = rotations[f, 2, 0], rotations[f, 2, 1], rotations[f, 2, 2]
+            rx = r00 * x + r01 * y + r02 * z
+            ry = r10 * x + r11 * y + r12 * z
+            rz = r20 * x + r21 * y + r22 * z
+            depth = rz + translations[f, 2]
+            if depth <= _MIN_DEPTH:
                 continue
-            a, b = (rx + t[0]) / z, (ry + t[1]) / z
-            q = a * a + b * b
-            radial = 1.0 + k1 * q
+            inverse_depth = 1.0 / depth
+            a, b = (rx + translations[f, 0]) * inverse_depth, (ry + translations[f, 1]) * inverse_depth
+            square = a * a + b * b
+            radial = 1.0 + k1 * square
             du, dv = focal * radial * a + shared[2] - pixel[o, 0], focal * radial * b + shared[3] - pixel[o, 1]
             weight = 1.0 / (1.0 + (du * du + dv * dv) / width)
             # derivative of the pixel by the normalised ray, then by the point in the camera
             aa, ab, bb = focal * (radial + 2 * k1 * a * a), focal * 2 * k1 * a * b, focal * (radial + 2 * k1 * b * b)
-            along[0, 0], along[0, 1], along[0, 2] = aa / z, ab / z, -(aa * a + ab * b) / z
-            along[1, 0], along[1, 1], along[1, 2] = ab / z, bb / z, -(ab * a + bb * b) / z
-            for i in range(2):
-                jacobian[i, 0] = along[i, 2] * ry - along[i, 1] * rz
-                jacobian[i, 1] = along[i, 0] * rz - along[i, 2] * rx
-                jacobian[i, 2] = along[i, 1] * rx - along[i, 0] * ry
-                jacobian[i, 3], jacobian[i, 4], jacobian[i, 5] = along[i, 0], along[i, 1], along[i, 2]
-                for j in range(3):
-                    on_point[i, j] = along[i, 0] * r[0, j] + along[i, 1] * r[1, j] + along[i, 2] * r[2, j]
-            if free[0]:
+            a00, a01, a02 = aa * inverse_depth, ab * inverse_depth, -(aa * a + ab * b) * inverse_depth
+            a10, a11, a12 = a01, bb * inverse_depth, -(ab * a + bb * b) * inverse_depth
+            w00, w01, w02, w10, w11, w12 = (
+                weight * a00,
+                weight * a01,
+                weight * a02,
+                weight * a10,
+                weight * a11,
+                weight * a12,
+            )
+            m00, m01, m02 = w00 * a00 + w10 * a10, w00 * a01 + w10 * a11, w00 * a02 + w10 * a12
+            m11, m12, m22 = w01 * a01 + w11 * a11, w01 * a02 + w11 * a12, w02 * a02 + w12 * a12
+            t0, t1, t2 = w00 * du + w10 * dv, w01 * du + w11 * dv, w02 * du + w12 * dv
+            # coupling of translation and point, M R
+            b00, b01, b02 = (
+                m00 * r00 + m01 * r10 + m02 * r20,
+                m00 * r01 + m01 * r11 + m02 * r21,
+                m00 * r02 + m01 * r12 + m02 * r22,
+            )
+            b10, b11, b12 = (
+                m01 * r00 + m11 * r10 + m12 * r20,
+                m01 * r01 + m11 * r11 + m12 * r21,
+                m01 * r02 + m11 * r12 + m12 * r22,
+            )
+            b20, b21, b22 = (
+                m02 * r00 + m12 * r10 + m22 * r20,
+                m02 * r01 + m12 * r11 + m22 * r21,
+                m02 * r02 + m12 * r12 + m22 * r22,
+            )
+            v00 += r00 * b00 + r10 * b10 + r20 * b20
+            v01 += r00 * b01 + r10 * b11 + r20 * b21
+            v02 += r00 * b02 + r10 * b12 + r20 * b22
+            v11 += r01 * b01 + r11 * b11 + r21 * b21
+            v12 += r01 * b02 + r11 * b12 + r21 * b22
+            v22 += r02 * b02 + r12 * b12 + r22 * b22
+            g0 += r00 * t0 + r10 * t1 + r20 * t2
+            g1 += r01 * t0 + r11 * t1 + r21 * t2
+            g2 += r02 * t0 + r12 * t1 + r22 * t2
+            if any_free:
+                factor = focal * radial
+                on_shared[0, 0], on_shared[0, 1] = factor * a, factor * b
                 # what the stretch moves in this camera: R e (e . (X - c)), with X - c = R^T (R X + t)
-                ex = r[0, 0] * axis[0] + r[0, 1] * axis[1] + r[0, 2] * axis[2]
-                ey = r[1, 0] * axis[0] + r[1, 1] * axis[1] + r[1, 2] * axis[2]
-                ez = r[2, 0] * axis[0] + r[2, 1] * axis[1] + r[2, 2] * axis[2]
-                reach = ex * (rx + t[0]) + ey * (ry + t[1]) + ez * z
-                for i in range(2):
-                    jacobian[i, 6] = reach * (along[i, 0] * ex + along[i, 1] * ey + along[i, 2] * ez)
-                jacobian[0, 6] += focal * radial * a
-                jacobian[1, 6] += focal * radial * b
-            else:
-                jacobian[0, 6] = jacobian[1, 6] = 0.0
-            jacobian[0, 7] = focal * q * a if free[1] else 0.0
-            jacobian[1, 7] = focal * q * b if free[1] else 0.0
-            for i in range(3):
-                g[i] += weight * (on_point[0, i] * du + on_point[1, i] * dv)
-                for j in range(3):
-                    v[i, j] += weight * (on_point[0, i] * on_point[0, j] + on_point[1, i] * on_point[1, j])
-            camera = _DIMENSIONS_OF_CAMERA * slot[frame[o]]
-            for i in range(_SHARED):
-                right[base + i] -= weight * (jacobian[0, 6 + i] * du + jacobian[1, 6 + i] * dv)
-                for j in range(_SHARED):
-                    system[base + i, base + j] += weight * (
-                        jacobian[0, 6 + i] * jacobian[0, 6 + j] + jacobian[1, 6 + i] * jacobian[1, 6 + j]
-                    )
-                for j in range(3):
-                    shared_coupling[i, j] += weight * (
-                        jacobian[0, 6 + i] * on_point[0, j] + jacobian[1, 6 + i] * on_point[1, j]
-                    )
-            if camera < 0:
+                ex = r00 * axis[0] + r01 * axis[1] + r02 * axis[2]
+                ey = r10 * axis[0] + r11 * axis[1] + r12 * axis[2]
+                ez = r20 * axis[0] + r21 * axis[1] + r22 * axis[2]
+                reach = ex * (rx + translations[f, 0]) + ey * (ry + translations[f, 1]) + ez * depth
+                on_shared[0, 0] += reach * (a00 * ex + a01 * ey + a02 * ez)
+                on_shared[0, 1] += reach * (a10 * ex + a11 * ey + a12 * ez)
+                on_shared[1, 0], on_shared[1, 1] = focal * square * a, focal * square * b
+                on_shared[2, 0], on_shared[3, 1] = 1.0, 1.0
+                for k in range(_SHARED):
+                    if not free[k]:
+                        on_shared[k, 0] = on_shared[k, 1] = 0.0
+                    s0, s1 = on_shared[k, 0], on_shared[k, 1]
+                    right[base + k] -= weight * (s0 * du + s1 * dv)
+                    q[k, 0], q[k, 1], q[k, 2] = w00 * s0 + w10 * s1, w01 * s0 + w11 * s1, w02 * s0 + w12 * s1
+                    shared_coupling[k, 0] += r00 * q[k, 0] + r10 * q[k, 1] + r20 * q[k, 2]
+                    shared_coupling[k, 1] += r01 * q[k, 0] + r11 * q[k, 1] + r21 * q[k, 2]
+                    shared_coupling[k, 2] += r02 * q[k, 0] + r12 * q[k, 1] + r22 * q[k, 2]
+                for k in range(_SHARED):
+                    for j in range(k, _SHARED):
+                        system[base + k, base + j] += weight * (
+                            on_shared[k, 0] * on_shared[j, 0] + on_shared[k, 1] * on_shared[j, 1]
+                        )
+            if slot[f] < 0:
                 continue
-            for i in range(6):
-                right[camera + i] -= weight * (jacobian[0, i] * du + jacobian[1, i] * dv)
-                for j in range(6):
-                    system[camera + i, camera + j] += weight * (
-                        jacobian[0, i] * jacobian[0, j] + jacobian[1, i] * jacobian[1, j]
-                    )
-                for j in range(_SHARED):
-                    system[camera + i, base + j] += weight * (
-                        jacobian[0, i] * jacobian[0, 6 + j] + jacobian[1, i] * jacobian[1, 6 + j]
-                    )
-                for j in range(3):
-                    coupling[m, i, j] = weight * (jacobian[0, i] * on_point[0, j] + jacobian[1, i] * on_point[1, j])
-        trace = v[0, 0] + v[1, 1] + v[2, 2]
+            at = _DIMENSIONS_OF_CAMERA * slot[f]
+            right[at] -= ry * t2 - rz * t1
+            right[at + 1] -= rz * t0 - rx * t2
+            right[at + 2] -= rx * t1 - ry * t0
+            right[at + 3] -= t0
+            right[at + 4] -= t1
+            right[at + 5] -= t2
+            # rotation and translation, r x M
+            h00, h01, h02 = ry * m02 - rz * m01, ry * m12 - rz * m11, ry * m22 - rz * m12
+            h10, h11, h12 = rz * m00 - rx * m02, rz * m01 - rx * m12, rz * m02 - rx * m22
+            h20, h21, h22 = rx * m01 - ry * m00, rx * m11 - ry * m01, rx * m12 - ry * m02
+            system[at, at] += ry * h02 - rz * h01
+            system[at, at + 1] += rz * h00 - rx * h02
+            system[at, at + 2] += rx * h01 - ry * h00
+            system[at + 1, at + 1] += rz * h10 - rx * h12
+            system[at + 1, at + 2] += rx * h11 - ry * h10
+            system[at + 2, at + 2] += rx * h21 - ry * h20
+            system[at, at + 3] += h00
+            system[at, at + 4] += h01
+            system[at, at + 5] += h02
+            system[at + 1, at + 3] += h10
+            system[at + 1, at + 4] += h11
+            system[at + 1, at + 5] += h12
+            system[at + 2, at + 3] += h20
+            system[at + 2, at + 4] += h21
+            system[at + 2, at + 5] += h22
+            system[at + 3, at + 3] += m00
+            system[at + 3, at + 4] += m01
+            system[at + 3, at + 5] += m02
+            system[at + 4, at + 4] += m11
+            system[at + 4, at + 5] += m12
+            system[at + 5, at + 5] += m22
+            if any_free:
+                for k in range(_SHARED):
+                    q0, q1, q2 = q[k, 0], q[k, 1], q[k, 2]
+                    system[at, base + k] += ry * q2 - rz * q1
+                    system[at + 1, base + k] += rz * q0 - rx * q2
+                    system[at + 2, base + k] += rx * q1 - ry * q0
+                    system[at + 3, base + k] += q0
+                    system[at + 4, base + k] += q1
+                    system[at + 5, base + k] += q2
+            k = 6 * used
+            c0[k], c1[k], c2[k] = ry * b20 - rz * b10, ry * b21 - rz * b11, ry * b22 - rz * b12
+            c0[k + 1], c1[k + 1], c2[k + 1] = rz * b00 - rx * b20, rz * b01 - rx * b21, rz * b02 - rx * b22
+            c0[k + 2], c1[k + 2], c2[k + 2] = rx * b10 - ry * b00, rx * b11 - ry * b01, rx * b12 - ry * b02
+            c0[k + 3], c1[k + 3], c2[k + 3] = b00, b01, b02
+            c0[k + 4], c1[k + 4], c2[k + 4] = b10, b11, b12
+            c0[k + 5], c1[k + 5], c2[k + 5] = b20, b21, b22
+            slots[used], rows[used] = slot[f], o
+            used += 1
+        trace = v00 + v11 + v22
         if trace <= 0.0:
             continue
-        for i in range(3):
-            v[i, i] += damping * v[i, i] + 1e-12 * trace
-        inverse = _inverse3(v)
-        for i in range(3):
-            point_step[p, i] = inverse[i, 0] * g[0] + inverse[i, 1] * g[1] + inverse[i, 2] * g[2]
-        for i in range(_SHARED):
-            for j in range(3):
-                shared_product[i, j] = (
-                    shared_coupling[i, 0] * inverse[0, j]
-                    + shared_coupling[i, 1] * inverse[1, j]
-                    + shared_coupling[i, 2] * inverse[2, j]
-                )
-            right[base + i] += shared_product[i, 0] * g[0] + shared_product[i, 1] * g[1] + shared_product[i, 2] * g[2]
-            for j in range(3):
-                elimination[first, 6 + i, j] = shared_product[i, j]
-        for i in range(_SHARED):
-            for j in range(_SHARED):
-                system[base + i, base + j] -= (
-                    shared_product[i, 0] * shared_coupling[j, 0]
-                    + shared_product[i, 1] * shared_coupling[j, 1]
-                    + shared_product[i, 2] * shared_coupling[j, 2]
-                )
-        for o in range(first, last):
-            m = o - first
-            camera = _DIMENSIONS_OF_CAMERA * slot[frame[o]]
-            if camera < 0:
-                continue
+        v00 += damping * v00 + 1e-12 * trace
+        v11 += damping * v11 + 1e-12 * trace
+        v22 += damping * v22 + 1e-12 * trace
+        i00, i01, i02, i11, i12, i22 = _inverse_symmetric(v00, v01, v02, v11, v12, v22)
+        s0, s1, s2 = i00 * g0 + i01 * g1 + i02 * g2, i01 * g0 + i11 * g1 + i12 * g2, i02 * g0 + i12 * g1 + i22 * g2
+        point_step[p, 0], point_step[p, 1], point_step[p, 2] = s0, s1, s2
+        for k in range(6 * used):
+            d0, d1, d2 = c0[k], c1[k], c2[k]
+            p0[k] = d0 * i00 + d1 * i01 + d2 * i02
+            p1[k] = d0 * i01 + d1 * i11 + d2 * i12
+            p2[k] = d0 * i02 + d1 * i12 + d2 * i22
+        if any_free:
+            for k in range(_SHARED):
+                d0, d1, d2 = shared_coupling[k, 0], shared_coupling[k, 1], shared_coupling[k, 2]
+                e0 = d0 * i00 + d1 * i01 + d2 * i02
+                e1 = d0 * i01 + d1 * i11 + d2 * i12
+                e2 = d0 * i02 + d1 * i12 + d2 * i22
+                shared_elimination[p, k, 0], shared_elimination[p, k, 1], shared_elimination[p, k, 2] = e0, e1, e2
+                right[base + k] += e0 * g0 + e1 * g1 + e2 * g2
+                for j in range(k, _SHARED):
+                    system[base + k, base + j] -= (
+                        e0 * shared_coupling[j, 0] + e1 * shared_coupling[j, 1] + e2 * shared_coupling[j, 2]
+                    )
+        for n in range(used):
+            at = _DIMENSIONS_OF_CAMERA * slots[n]
             for i in range(6):
-                for j in range(3):
-                    product[m, i, j] = (
-                        coupling[m, i, 0] * inverse[0, j]
-                        + coupling[m, i, 1] * inverse[1, j]
-                        + coupling[m, i, 2] * inverse[2, j]
-                    )
-                    elimination[o, i, j] = product[m, i, j]
-                right[camera + i] += product[m, i, 0] * g[0] + product[m, i, 1] * g[1] + product[m, i, 2] * g[2]
-                for j in range(_SHARED):
-                    system[camera + i, base + j] -= (
-                        product[m, i, 0] * shared_coupling[j, 0]
-                        + product[m, i, 1] * shared_coupling[j, 1]
-                        + product[m, i, 2] * shared_coupling[j, 2]
-                    )
-            # blocks above the diagonal only: frames rise along a track
-            for n in range(m + 1):
-                other = _DIMENSIONS_OF_CAMERA * slot[frame[first + n]]
-                if other < 0:
-                    continue
-                for i in range(6):
-                    for j in range(6):
-                        system[other + i, camera + j] -= (
-                            product[n, i, 0] * coupling[m, j, 0]
-                            + product[n, i, 1] * coupling[m, j, 1]
-                            + product[n, i, 2] * coupling[m, j, 2]
+                k = 6 * n + i
+                d0, d1, d2 = p0[k], p1[k], p2[k]
+                elimination[rows[n], i, 0], elimination[rows[n], i, 1], elimination[rows[n], i, 2] = d0, d1, d2
+                right[at + i] += d0 * g0 + d1 * g1 + d2 * g2
+                if any_free:
+                    for j in range(_SHARED):
+                        system[at + i, base + j] -= (
+                            d0 * shared_coupling[j, 0] + d1 * shared_coupling[j, 1] + d2 * shared_coupling[j, 2]
                         )
+            # blocks above the diagonal only: frames rise along a track; cameras that follow each other in one go
+            m = n
+            while m < used:
+                end = m + 1
+                while end < used and slots[end] == slots[end - 1] + 1:
+                    end += 1
+                count = 6 * (end - m)
+                e0, e1, e2 = c0[6 * m : 6 * m + count], c1[6 * m : 6 * m + count], c2[6 * m : 6 * m + count]
+                column = _DIMENSIONS_OF_CAMERA * slots[m]
+                for i in range(6):
+                    d0, d1, d2 = p0[6 * n + i], p1[6 * n + i], p2[6 * n + i]
+                    row = system[at + i, column : column + count]
+                    for j in range(count):
+                        row[j] -= d0 * e0[j] + d1 * e1[j] + d2 * e2[j]
+                m = end
     for k in range(_SHARED):
         system[base + k, base + k] += information[k]
         right[base + k] -= information[k] * (shared[k] - mean[k])
@@ -460,23 +528,16 @@ def _reduce(  # type: ignore[no-untyped-def]
             system[i, j] = system[j, i]
     for i in range(size):
         system[i, i] += damping * system[i, i] + 1e-12
-    return system, right, elimination, point_step
+    return system, right, elimination, shared_elimination, point_step
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inverse3(m):  # type: ignore[no-untyped-def]
-    out = np.empty((3, 3))
-    out[0, 0] = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
-    out[0, 1] = m[0, 2] * m[2, 1] - m[0, 1] * m[2, 2]
-    out[0, 2] = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-    out[1, 0] = m[1, 2] * m[2, 0] - m[1, 0] * m[2, 2]
-    out[1, 1] = m[0, 0] * m[2, 2] - m[0, 2] * m[2, 0]
-    out[1, 2] = m[0, 2] * m[1, 0] - m[0, 0] * m[1, 2]
-    out[2, 0] = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
-    out[2, 1] = m[0, 1] * m[2, 0] - m[0, 0] * m[2, 1]
-    out[2, 2] = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-    determinant = m[0, 0] * out[0, 0] + m[0, 1] * out[1, 0] + m[0, 2] * out[2, 0]
-    return out / determinant
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _inverse_symmetric(m00, m01, m02, m11, m12, m22):  # type: ignore[no-untyped-def]
+    """Upper triangle of the inverse of a symmetric 3x3 matrix."""
+    i00, i01, i02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
+    i11, i12, i22 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12, m00 * m11 - m01 * m01
+    scale = 1.0 / (m00 * i00 + m01 * i01 + m02 * i02)
+    return i00 * scale, i01 * scale, i02 * scale, i11 * scale, i12 * scale, i22 * scale
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -509,7 +570,7 @@ def solve_positive(system, right):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _back_substitute(  # type: ignore[no-untyped-def]
-    points, step, start, frame, elimination, point_step, axis, centre, slot
+    points, step, start, frame, elimination, shared_elimination, point_step, axis, centre, slot
 ):
     moved = points.copy()
     base = len(step) - _SHARED
@@ -526,7 +587,7 @@ def _back_substitute(  # type: ignore[no-untyped-def]
             moved[p, j] += stretch * reach * axis[j] - point_step[p, j]
         for i in range(_SHARED):
             for j in range(3):
-                moved[p, j] -= elimination[start[p], 6 + i, j] * step[base + i]
+                moved[p, j] -= shared_elimination[p, i, j] * step[base + i]
         for o in range(start[p], start[p + 1]):
             camera = _DIMENSIONS_OF_CAMERA * slot[frame[o]]
             if camera < 0:

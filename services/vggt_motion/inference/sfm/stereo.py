@@ -55,7 +55,7 @@ def match(
 
     Args:
         reference: (H, W) float32 grey image.
-        views: at least one neighbour.
+        views: one to four neighbours.
         intrinsics: of the lattice (H, W), shared by all.
         nearest_inverse_depth: the sweep goes from 0 to here.
         hypotheses: number of steps of the sweep.
@@ -134,10 +134,41 @@ def _turned(rotation, rays, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _warp(source, turned, translation, camera, inverse_depth, columns, rows, warped, inside):  # type: ignore[no-untyped-def]
-    """Bilinear samples of ``source`` where each pixel with its inverse depth is seen, border repeated.
+def _sums(first, second, third, fourth, fifth, padded):  # type: ignore[no-untyped-def]
+    """Sums down the five rows of a window, with the border repeated at both ends: (W + 4,)."""
+    width = len(first)
+    inner = padded[2 : 2 + width]
+    for j in range(width):
+        inner[j] = first[j] + second[j] + third[j] + fourth[j] + fifth[j]
+    padded[0] = padded[1] = padded[2]
+    padded[width + 3] = padded[width + 2] = padded[width + 1]
 
-    The coordinates of a row are computed apart from the samples: that loop then runs on several pixels at once.
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _statistics(reference):  # type: ignore[no-untyped-def]
+    """Mean and deviation (H, W) of each window, noise included."""
+    height, width = reference.shape
+    mean, deviation = np.empty_like(reference), np.empty_like(reference)
+    square = reference * reference
+    sums, squares = np.empty(width + 4, dtype=np.float32), np.empty(width + 4, dtype=np.float32)
+    share = np.float32(1.0 / (2 * _RADIUS_PX + 1) ** 2)
+    for i in range(height):
+        a, b, d, e = max(i - 2, 0), max(i - 1, 0), min(i + 1, height - 1), min(i + 2, height - 1)
+        _sums(reference[a], reference[b], reference[i], reference[d], reference[e], sums)
+        _sums(square[a], square[b], square[i], square[d], square[e], squares)
+        for j in range(width):
+            m = (sums[j] + sums[j + 1] + sums[j + 2] + sums[j + 3] + sums[j + 4]) * share
+            mm = (squares[j] + squares[j + 1] + squares[j + 2] + squares[j + 3] + squares[j + 4]) * share
+            mean[i, j] = m
+            deviation[i, j] = np.sqrt(max(mm - m * m, np.float32(0.0)) + np.float32(_NOISE_VARIANCE))
+    return mean, deviation
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _warp_row(source, x, y, z, translation, camera, inverse_depth, columns, rows, warped, inside):  # type: ignore[no-untyped-def]
+    """Bilinear samples of ``source`` where a row of pixels with their inverse depths is seen, border repeated.
+
+    The coordinates are computed apart from the samples: that loop then runs on several pixels at once.
     """
     height, width = source.shape
     tx, ty, tz = translation[0], translation[1], translation[2]
@@ -145,110 +176,106 @@ def _warp(source, turned, translation, camera, inverse_depth, columns, rows, war
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     last_u, last_v = np.float32(width - 1.001), np.float32(height - 1.001)
     end_u, end_v = np.float32(width) - half, np.float32(height) - half
-    for i in range(height):
-        for j in range(width):
-            w = inverse_depth[i, j]
-            pz = turned[2, i, j] + w * tz
-            front = pz > np.float32(0.05)
-            scale = one / (pz if front else one)
-            a, b = (turned[0, i, j] + w * tx) * scale, (turned[1, i, j] + w * ty) * scale
-            factor = one + k1 * (a * a + b * b)
-            u, v = fx * a * factor + cx, fy * b * factor + cy
-            inside[i, j] = front and u >= -half and v >= -half and u <= end_u and v <= end_v
-            columns[j] = min(max(u, zero), last_u)
-            rows[j] = min(max(v, zero), last_v)
-        for j in range(width):
-            u, v = columns[j], rows[j]
-            x, y = np.int32(u), np.int32(v)
-            s, t = u - np.float32(x), v - np.float32(y)
-            top, bottom = source[y, x], source[y + 1, x]
-            top += s * (source[y, x + 1] - top)
-            bottom += s * (source[y + 1, x + 1] - bottom)
-            warped[i, j] = top + t * (bottom - top)
+    for j in range(len(x)):
+        w = inverse_depth[j]
+        pz = z[j] + w * tz
+        front = pz > np.float32(0.05)
+        scale = one / (pz if front else one)
+        a, b = (x[j] + w * tx) * scale, (y[j] + w * ty) * scale
+        factor = one + k1 * (a * a + b * b)
+        u, v = fx * a * factor + cx, fy * b * factor + cy
+        inside[j] = one if front and u >= -half and v >= -half and u <= end_u and v <= end_v else zero
+        columns[j] = min(max(u, zero), last_u)
+        rows[j] = min(max(v, zero), last_v)
+    flat = source.reshape(height * width)
+    stride = np.uint32(width)
+    for j in range(len(x)):
+        u, v = columns[j], rows[j]
+        c, r = np.int32(u), np.int32(v)
+        s, t = u - np.float32(c), v - np.float32(r)
+        at = np.uint32(r) * stride + np.uint32(c)
+        top, bottom = flat[at], flat[at + stride]
+        top += s * (flat[at + np.uint32(1)] - top)
+        bottom += s * (flat[at + stride + np.uint32(1)] - bottom)
+        warped[j] = top + t * (bottom - top)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _box(values, horizontal, out):  # type: ignore[no-untyped-def]
-    """Mean over the window, with the border repeated."""
-    height, width = values.shape
-    scale = np.float32(1.0 / (2 * _RADIUS_PX + 1) ** 2)
-    for i in range(height):
-        total = np.float32(0.0)
-        for k in range(-_RADIUS_PX, _RADIUS_PX + 1):
-            total += values[i, min(max(k, 0), width - 1)]
-        horizontal[i, 0] = total
-        for j in range(1, width):
-            total += values[i, min(j + _RADIUS_PX, width - 1)] - values[i, max(j - 1 - _RADIUS_PX, 0)]
-            horizontal[i, j] = total
-    for i in range(height):
-        for j in range(width):
-            total = np.float32(0.0)
-            for k in range(-_RADIUS_PX, _RADIUS_PX + 1):
-                total += horizontal[min(max(i + k, 0), height - 1), j]
-            out[i, j] = total * scale
+def _score(  # type: ignore[no-untyped-def]
+    reference, mean, deviation, source, turned, translation, camera, inverse_depth, work, line, best, following, seen
+):
+    """Take the correlation with one neighbour into the best two of each pixel, and into how many there are.
 
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _correlate(reference, mean, deviation, warped, inside, work, out):  # type: ignore[no-untyped-def]
-    """Windowed correlation of two images; -1 where the pixel is not inside."""
+    Work is done row by row, so that a window's rows are still in the nearest cache when they are needed.
+    """
     height, width = reference.shape
-    product, horizontal, warped_mean, warped_square, cross = work[0], work[1], work[2], work[3], work[4]
-    _box(warped, horizontal, warped_mean)
-    for i in range(height):
+    warped, square, product, inside = work[0], work[1], work[2], work[3]
+    columns, rows, sums, squares, products = line[0], line[1], line[2], line[3], line[4]
+    noise, share, lowest = np.float32(_NOISE_VARIANCE), np.float32(1.0 / (2 * _RADIUS_PX + 1) ** 2), np.float32(-1.0)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for k in range(height + _RADIUS_PX):
+        if k < height:
+            _warp_row(
+                source,
+                turned[0, k],
+                turned[1, k],
+                turned[2, k],
+                translation,
+                camera,
+                inverse_depth[k],
+                columns,
+                rows,
+                warped[k],
+                inside[k],
+            )
+            w, r, ww, wr = warped[k], reference[k], square[k], product[k]
+            for j in range(width):
+                ww[j] = w[j] * w[j]
+                wr[j] = w[j] * r[j]
+        i = k - _RADIUS_PX
+        if i < 0:
+            continue
+        a, b, d, e = max(i - 2, 0), max(i - 1, 0), min(i + 1, height - 1), min(i + 2, height - 1)
+        _sums(warped[a], warped[b], warped[i], warped[d], warped[e], sums)
+        _sums(square[a], square[b], square[i], square[d], square[e], squares)
+        _sums(product[a], product[b], product[i], product[d], product[e], products)
+        row_mean, row_deviation, row_inside = mean[i], deviation[i], inside[i]
+        row_best, row_following, row_seen = best[i], following[i], seen[i]
         for j in range(width):
-            product[i, j] = warped[i, j] * warped[i, j]
-    _box(product, horizontal, warped_square)
-    for i in range(height):
-        for j in range(width):
-            product[i, j] = warped[i, j] * reference[i, j]
-    _box(product, horizontal, cross)
-    noise = np.float32(_NOISE_VARIANCE)
-    for i in range(height):
-        for j in range(width):
-            if inside[i, j]:
-                variance = max(warped_square[i, j] - warped_mean[i, j] * warped_mean[i, j], np.float32(0.0)) + noise
-                covariance = cross[i, j] - warped_mean[i, j] * mean[i, j]
-                out[i, j] = covariance / (deviation[i, j] * math.sqrt(variance))
-            else:
-                out[i, j] = np.float32(-1.0)
+            m = (sums[j] + sums[j + 1] + sums[j + 2] + sums[j + 3] + sums[j + 4]) * share
+            mm = (squares[j] + squares[j + 1] + squares[j + 2] + squares[j + 3] + squares[j + 4]) * share
+            mr = (products[j] + products[j + 1] + products[j + 2] + products[j + 3] + products[j + 4]) * share
+            variance = max(mm - m * m, zero) + noise
+            value = (mr - m * row_mean[j]) / (row_deviation[j] * np.sqrt(variance))
+            value = value if row_inside[j] > zero else lowest
+            top = row_best[j]
+            row_best[j] = max(top, value)
+            row_following[j] = max(row_following[j], min(top, value))
+            row_seen[j] += one if value > lowest else zero
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _window_statistics(reference, work):  # type: ignore[no-untyped-def]
+def _combined(  # type: ignore[no-untyped-def]
+    reference, mean, deviation, sources, turned, translations, camera, inverse_depth, work, line, best, following, seen
+):
+    """Mean correlation ``best`` (H, W) of the better half of the neighbours that see a pixel, -1 without any.
+
+    The others may be occluded. There are four at most: the best one of up to two, the best two of three and four.
+    """
+    best[:] = np.float32(-1.0)
+    following[:] = np.float32(-1.0)
+    seen[:] = np.float32(0.0)
+    for n in range(len(sources)):
+        _score(
+            reference, mean, deviation, sources[n], turned[n], translations[n], camera, inverse_depth, work, line,
+            best, following, seen,
+        )  # fmt: skip
     height, width = reference.shape
-    mean, square = np.empty_like(reference), np.empty_like(reference)
-    _box(reference, work[1], mean)
     for i in range(height):
+        row_best, row_following, row_seen = best[i], following[i], seen[i]
         for j in range(width):
-            work[0, i, j] = reference[i, j] * reference[i, j]
-    _box(work[0], work[1], square)
-    for i in range(height):
-        for j in range(width):
-            variance = max(square[i, j] - mean[i, j] * mean[i, j], np.float32(0.0)) + np.float32(_NOISE_VARIANCE)
-            square[i, j] = math.sqrt(variance)
-    return mean, square
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _better_half(values, count):  # type: ignore[no-untyped-def]
-    """Mean of the better half of the neighbours that see the pixel: the others may be occluded. -1 without any."""
-    kept = 0
-    for n in range(count):
-        value = values[n]
-        if value > np.float32(-1.0):
-            k = kept
-            while k > 0 and values[k - 1] < value:
-                values[k] = values[k - 1]
-                k -= 1
-            values[k] = value
-            kept += 1
-    if kept == 0:
-        return np.float32(-1.0)
-    half = (kept + 1) // 2
-    total = np.float32(0.0)
-    for k in range(half):
-        total += values[k]
-    return total / np.float32(half)
+            both = np.float32(0.5) * (row_best[j] + row_following[j])
+            row_best[j] = both if row_seen[j] > np.float32(2.5) else row_best[j]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -258,28 +285,34 @@ def sweep_cost(reference, sources, rotations, translations, rays, camera, invers
     height, width = reference.shape
     depths = len(inverse_depths)
     rotations32, translations32 = rotations.astype(np.float32), translations.astype(np.float32)
-    work = np.empty((5, height, width), dtype=np.float32)
-    mean, deviation = _window_statistics(reference, work)
+    mean, deviation = _statistics(reference)
+    work, line = np.empty((4, height, width), dtype=np.float32), np.empty((5, width + 4), dtype=np.float32)
     plane = np.empty((height, width), dtype=np.float32)
-    warped = np.empty((height, width), dtype=np.float32)
-    inside = np.empty((height, width), dtype=np.bool_)
-    scores = np.empty((count, height, width), dtype=np.float32)
+    best, following, seen = np.empty_like(plane), np.empty_like(plane), np.empty_like(plane)
     volume = np.empty((height, width, depths), dtype=np.float32)
-    values = np.empty(count, dtype=np.float32)
     turned = np.empty((count, 3, height, width), dtype=np.float32)
     for n in range(count):
         _turned(rotations32[n], rays, turned[n])
-    columns, rows = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     for d in range(depths):
         plane[:] = np.float32(inverse_depths[d])
-        for n in range(count):
-            _warp(sources[n], turned[n], translations32[n], camera, plane, columns, rows, warped, inside)
-            _correlate(reference, mean, deviation, warped, inside, work, scores[n])
+        _combined(
+            reference,
+            mean,
+            deviation,
+            sources,
+            turned,
+            translations32,
+            camera,
+            plane,
+            work,
+            line,
+            best,
+            following,
+            seen,
+        )
         for i in range(height):
             for j in range(width):
-                for n in range(count):
-                    values[n] = scores[n, i, j]
-                score = _better_half(values, count)
+                score = best[i, j]
                 volume[i, j, d] = np.float32(1.0) - score if score > np.float32(-1.0) else np.float32(_UNSEEN_COST)
     return volume
 
@@ -350,30 +383,23 @@ def refine(  # type: ignore[no-untyped-def]
     count = len(sources)
     height, width = reference.shape
     rotations32, translations32 = rotations.astype(np.float32), translations.astype(np.float32)
-    work = np.empty((5, height, width), dtype=np.float32)
-    mean, deviation = _window_statistics(reference, work)
+    mean, deviation = _statistics(reference)
+    work, line = np.empty((4, height, width), dtype=np.float32), np.empty((5, width + 4), dtype=np.float32)
     inverse_depth = np.empty((height, width), dtype=np.float32)
-    warped = np.empty((height, width), dtype=np.float32)
-    inside = np.empty((height, width), dtype=np.bool_)
-    scores = np.empty((count, height, width), dtype=np.float32)
+    following, seen = np.empty_like(inverse_depth), np.empty_like(inverse_depth)
     combined = np.empty((2 * reach + 1, height, width), dtype=np.float32)
-    values = np.empty(count, dtype=np.float32)
     turned = np.empty((count, 3, height, width), dtype=np.float32)
     for n in range(count):
         _turned(rotations32[n], rays, turned[n])
-    columns, rows = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     for k in range(2 * reach + 1):
+        shift = np.float32(k - reach) * spacing
         for i in range(height):
             for j in range(width):
-                inverse_depth[i, j] = max(level[i, j] + (k - reach) * spacing, np.float32(0.0)) * step
-        for n in range(count):
-            _warp(sources[n], turned[n], translations32[n], camera, inverse_depth, columns, rows, warped, inside)
-            _correlate(reference, mean, deviation, warped, inside, work, scores[n])
-        for i in range(height):
-            for j in range(width):
-                for n in range(count):
-                    values[n] = scores[n, i, j]
-                combined[k, i, j] = _better_half(values, count)
+                inverse_depth[i, j] = max(level[i, j] + shift, np.float32(0.0)) * step
+        _combined(
+            reference, mean, deviation, sources, turned, translations32, camera, inverse_depth, work, line,
+            combined[k], following, seen,
+        )  # fmt: skip
     out = np.empty_like(level)
     correlation = np.empty_like(level)
     curvature = np.zeros_like(level)
@@ -385,11 +411,11 @@ def refine(  # type: ignore[no-untyped-def]
                     best = k
             middle = min(max(best, 1), 2 * reach - 1)
             below, top, above = combined[middle - 1, i, j], combined[middle, i, j], combined[middle + 1, i, j]
-            bend = 2 * top - below - above
+            bend = np.float32(2.0) * top - below - above
             shift = np.float32(best - middle)
             if best == middle and bend > np.float32(1e-6):
                 shift = min(max(np.float32(0.5) * (above - below) / bend, np.float32(-0.5)), np.float32(0.5))
-            out[i, j] = max(level[i, j] + (middle - reach + shift) * spacing, np.float32(0.0))
+            out[i, j] = max(level[i, j] + (np.float32(middle - reach) + shift) * spacing, np.float32(0.0))
             correlation[i, j] = combined[best, i, j]
             curvature[i, j] = max(bend, np.float32(0.0)) / (spacing * spacing)
     return out, correlation, curvature
