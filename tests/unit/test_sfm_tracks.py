@@ -40,6 +40,19 @@ def shifted(offsets: list[tuple[float, float]], side: int = 260) -> list[npt.NDA
 OFFSETS = [(0.0, 0.0), (7.3, -2.6), (16.9, 3.4), (21.1, 9.75)]
 
 
+def test_what_is_remembered_is_of_the_same_images_and_the_same_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, other = working(shifted(OFFSETS)), working(shifted([(3.0, 1.0), *OFFSETS[1:]]))
+    half = first.usable.copy()
+    half[:, : half.shape[1] // 2] = False
+    for image in (first, other, replace(first, usable=half), first):
+        found = tracks.follow(image, [0, 1, 2, 3])
+        with monkeypatch.context() as fresh:
+            fresh.setattr(tracks, "_MEMORY", tracks._Memory())
+            again = tracks.follow(image, [0, 1, 2, 3])
+        np.testing.assert_array_equal(found.pixel, again.pixel)
+        np.testing.assert_array_equal(found.point, again.point)
+
+
 @pytest.mark.parametrize("method", [tracks.follow, tracks.match])
 def test_tracks_move_as_the_image_does(method) -> None:  # type: ignore[no-untyped-def]
     found = method(working(shifted(OFFSETS)), [0, 1, 2, 3])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -18,14 +17,13 @@ import numpy.typing as npt
 
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics, pixel_rays
-from vggt_motion.inference.sfm import stereo
+from vggt_motion.inference.sfm import parallel, stereo
 from vggt_motion.inference.sfm.images import GreyImage
 
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 MAX_NEIGHBOURS = 4
-_THREADS = 2  # one worker keeps two cores busy here; the result does not depend on it
 _REACH = 6  # keyframes to either side that are considered as neighbours
 _BEST_PARALLAX_PX = 8.0  # at the lattice: enough to see depth, little enough to look alike
 _PARALLAX_LOG_WIDTH = 0.9
@@ -83,10 +81,8 @@ def dense_depth(
         count = _hypotheses(views, sparse[position], intrinsics, nearest[position])
         return stereo.match(images[position], views, intrinsics, nearest[position], count)
 
-    # the kernels leave the interpreter's lock, and no frame's matching depends on another's
     matchable = [position for position in positions if neighbours[position]]
-    with ThreadPoolExecutor(_THREADS) as pool:
-        matched = dict(zip(matchable, pool.map(match, matchable), strict=True))
+    matched = dict(zip(matchable, parallel.each(match, matchable), strict=True))
     sigma = {position: _relative_sigma(matched[position]) for position in matched}
     rays = pixel_rays(intrinsics)
     camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1])

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import undistort_rays
-from vggt_motion.inference.sfm import bundle
+from vggt_motion.inference.sfm import bundle, parallel
 from vggt_motion.inference.sfm.bundle import Calibration, Observations, Scene
 from vggt_motion.inference.sfm.triangulation import triangulate
 
@@ -68,8 +68,8 @@ def grow(observations: Observations, frame_count: int, camera: Scene, calibratio
         None where no two neighbouring frames have a geometry.
     """
     rays = rays_of(observations, camera)
-    found = {a: _pair(observations, rays, a, camera.focal_px) for a in range(frame_count - 1)}
-    pairs = {a: pair for a, pair in found.items() if pair is not None}
+    found = parallel.each(lambda a: _pair(observations, rays, a, camera.focal_px), range(frame_count - 1))
+    pairs = {a: pair for a, pair in enumerate(found) if pair is not None}
     if not pairs:
         return None
     growing = _best_seed(observations, pairs, frame_count, camera)
@@ -184,8 +184,8 @@ def two_view_depths(rays_a: Array, rays_b: Array, rotation: Array, translation: 
 
 def _best_seed(observations: Observations, pairs: dict[int, _Pair], frame_count: int, camera: Scene) -> Grown | None:
     """The neighbours that start best: three where possible, judged by how many of their observations fit."""
-    best: tuple[float, Grown] | None = None
-    for a in sorted(pairs, key=lambda key: -pairs[key].score)[:_SEED_CANDIDATES]:
+
+    def started(a: int) -> tuple[float, Grown]:
         rotations, translations = np.tile(np.eye(3), (frame_count, 1, 1)), np.zeros((frame_count, 3))
         rotations[a + 1], translations[a + 1] = pairs[a].b_from_a[:3, :3], pairs[a].b_from_a[:3, 3]
         registered = np.zeros(frame_count, dtype=np.bool_)
@@ -199,10 +199,10 @@ def _best_seed(observations: Observations, pairs: dict[int, _Pair], frame_count:
         among = observations.subset(growing.registered[observations.frame])
         repeated = among.subset((np.diff(among.start) >= min(3, int(growing.registered.sum())))[among.point])
         errors = np.linalg.norm(bundle.residuals(growing.scene, repeated), axis=1)
-        quality = float((1.0 / (1.0 + errors**2)).sum()) * int(growing.registered.sum())
-        if best is None or quality > best[0]:
-            best = (quality, growing)
-    return best[1] if best is not None else None
+        return float((1.0 / (1.0 + errors**2)).sum()) * int(growing.registered.sum()), growing
+
+    candidates = sorted(pairs, key=lambda key: -pairs[key].score)[:_SEED_CANDIDATES]
+    return max(parallel.each(started, candidates), key=lambda start: start[0], default=(0.0, None))[1]
 
 
 def _place_next(growing: Grown, observations: Observations, pairs: dict[int, _Pair]) -> Grown | None:

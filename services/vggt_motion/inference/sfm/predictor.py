@@ -69,7 +69,7 @@ def _warm_up() -> None:
 
 
 class SfmPredictor:
-    """Predicts one submap at a time; holds no state between submaps."""
+    """Predicts one submap at a time; no result depends on what was predicted before."""
 
     name = _MODEL
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.inference.sfm import alignment, bundle, focal, globalmap, growth
+from vggt_motion.inference.sfm import alignment, bundle, focal, globalmap, growth, parallel
 from vggt_motion.inference.sfm.bundle import Calibration, Observations, Scene
 from vggt_motion.inference.sfm.focal import CameraPrior
 from vggt_motion.inference.sfm.images import GreyImage, WorkingImages
@@ -30,13 +30,14 @@ _REGROW_RELATIVE = 0.05  # a focal length that moved so far is grown from once m
 _MOST_EXPLAINED = 0.88
 _GOOD_EXPLAINED = 0.75
 _GOOD_REPROJECTION_PX = 0.5
+_SAME_COST = 0.02  # relative difference of the costs of starts that ended alike
 _MAX_K1 = 0.6  # beyond it a coefficient describes the scene, not a lens
 _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong distortion is believed
 _CAPPED_PX = 1.5  # an observation that misses by more belongs to something else, however far it misses
 _MIN_FRAME_OBSERVATIONS = 15
 # kernel px, gate px, iterations, tolerance
 _STAGES = ((2.0, 12.0, 15, 1e-3), (1.0, 5.0, 15, 1e-3), (0.5, 2.5, 20, 1e-4))
-_POLISH = ((0.5, 2.5, 15, 1e-4), (0.3, 1.5, 40, 3e-6))
+_POLISH = ((0.5, 2.5, 15, 1e-5), (0.3, 1.5, 60, 1e-6))
 
 
 @dataclass(frozen=True)
@@ -88,20 +89,25 @@ def solve(
     width_px = working.width_px
     observations = _observations(tracks, positions, working)
     calibration = prior.calibration(width_px)
-    best: Structure | None = None
-    attempts = []
-    for start, is_usual in prior.starts():
-        if best is not None and _is_convincing(best) and (prior.is_sure or not is_usual):
-            break
+
+    def grown(start: float) -> list[tuple[float, Structure | None]]:
         solved = _from_start(observations, positions, width_px, prior, calibration, start)
-        attempts.append(f"grown from focal {start:.2f} widths: {_outcome(solved)}")
-        best = _better(best, solved)
         if solved is None or not _is_worth_regrowing(solved, start, prior):
-            continue
+            return [(start, solved)]
         moved = solved.focal_over_width
-        again = _from_start(observations, positions, width_px, prior, calibration, moved)
-        attempts.append(f"grown from focal {moved:.2f} widths: {_outcome(again)}")
-        best = _better(best, again)
+        return [(start, solved), (moved, _from_start(observations, positions, width_px, prior, calibration, moved))]
+
+    starts = list(prior.starts())
+    # where the focal length is not sure, two starts are tried at least
+    at_once = 1 if prior.is_sure else sum(is_usual for _, is_usual in starts[:2])
+    ways = parallel.each(grown, [start for start, _ in starts[:at_once]])
+    for start, is_usual in starts[at_once:]:
+        best = _best(ways)
+        if best is not None and ((_is_convincing(best) and (prior.is_sure or not is_usual)) or _is_settled(ways)):
+            break
+        ways.append(grown(start))
+    best = _best(ways)
+    attempts = [f"grown from focal {start:.2f} widths: {_outcome(solved)}" for way in ways for start, solved in way]
     if best is None:
         return None, attempts
     deviations = abs(best.scene.radial_k1 - prior.radial_k1) / calibration.sigma[1]
@@ -206,10 +212,21 @@ def _in_unit_steps(solved: Structure) -> Structure:
     return replace(solved, scene=replace(scene, translations=scene.translations / unit, points=scene.points / unit))
 
 
-def _better(best: Structure | None, other: Structure | None) -> Structure | None:
-    if best is None or other is None:
-        return best or other
-    return min(best, other, key=lambda solved: solved.cost)
+def _best(ways: Sequence[Sequence[tuple[float, Structure | None]]]) -> Structure | None:
+    return min((solved for way in ways for _, solved in way if solved is not None), key=_cost_of, default=None)
+
+
+def _is_settled(ways: Sequence[Sequence[tuple[float, Structure | None]]]) -> bool:
+    """Whether the two best of the starts ended alike: a further one would end there too."""
+    ends = sorted((solved for way in ways if (solved := _best([way])) is not None), key=_cost_of)
+    if len(ends) < 2:
+        return False
+    first, second = ends[:2]
+    return bool((first.registered == second.registered).all()) and second.cost < (1.0 + _SAME_COST) * first.cost
+
+
+def _cost_of(solved: Structure) -> float:
+    return solved.cost
 
 
 def _outcome(solved: Structure | None) -> str:

@@ -5,9 +5,11 @@ Shi and Tomasi, "Good Features to Track" (1994); Kroeger et al., "Fast Optical F
 
 from __future__ import annotations
 
+import hashlib
 import itertools
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.inference.sfm import features
+from vggt_motion.inference.sfm import features, parallel
 from vggt_motion.inference.sfm.images import GreyImage, WorkingImages
 
 Array = npt.NDArray[np.float64]
@@ -36,6 +38,7 @@ _MIN_FOLLOWED = 130  # fewer tracks over a step are helped out by feature matche
 _SAME_POINT_PX = 1.0
 _MIN_EPIPOLAR_MATCHES = 16
 _EPIPOLAR_PX = 1.5
+_REMEMBERED = 16  # tracks of so many submaps, some hundred kilobytes each
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,42 @@ def vanished_share(tracks: Tracks, positions: Sequence[int], width_px: int) -> f
     return float(np.median(shares)) if shares else 0.0
 
 
+class _Memory:
+    """The tracks found last.
+
+    They depend on the images alone, and a submap is often predicted twice: with what is known of the camera by then.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._found: OrderedDict[tuple[object, ...], Tracks] = OrderedDict()
+
+    def recall(
+        self, find: Callable[[], Tracks], working: WorkingImages, positions: Sequence[int], *how: object
+    ) -> Tracks:
+        digest = hashlib.blake2b(working.usable.tobytes())
+        for position in positions:
+            digest.update(working.grey[position].tobytes())
+        key = (*how, working.width_px, working.height_px, tuple(positions), digest.digest())
+        with self._lock:
+            known = self._found.pop(key, None)
+        tracks = known if known is not None else find()
+        with self._lock:
+            self._found[key] = tracks
+            while len(self._found) > _REMEMBERED:
+                self._found.popitem(last=False)
+        return tracks
+
+
+_MEMORY = _Memory()
+
+
 def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
     """Follow corners from keyframe to keyframe; new ones start where none is left."""
+    return _MEMORY.recall(lambda: _follow(working, positions), working, positions, "follow")
+
+
+def _follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
     height, width = working.height_px, working.width_px
     ids = np.zeros(0, dtype=np.int64)
     pixels = np.zeros((0, 2), dtype=np.float32)
@@ -126,20 +163,24 @@ def follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
 
 
 def _flows(working: WorkingImages, positions: Sequence[int]) -> list[npt.NDArray[np.float32]]:
-    """Dense flow (H, W, 2) between neighbours, two pairs at a time: the library leaves the interpreter's lock."""
+    """Dense flow (H, W, 2) between neighbours."""
     create: Any = getattr(cv2, "DISOpticalFlow_create")  # noqa: B009  -- missing in the stubs of OpenCV 5
 
     def flow(pair: tuple[int, int]) -> npt.NDArray[np.float32]:
         estimator = create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # holds buffers: one for each call
         return np.asarray(estimator.calc(working.grey[pair[0]], working.grey[pair[1]], None), dtype=np.float32)
 
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(flow, itertools.pairwise(positions)))
+    return parallel.each(flow, list(itertools.pairwise(positions)))
 
 
 def match(working: WorkingImages, positions: Sequence[int], reach: int = 4) -> Tracks:
     """Tracks of features matched between all frames up to ``reach`` apart: slower than following, but sure-footed."""
-    detected = {position: features.detect(working.grey[position], working.usable) for position in positions}
+    return _MEMORY.recall(lambda: _match(working, positions, reach), working, positions, "match", reach)
+
+
+def _match(working: WorkingImages, positions: Sequence[int], reach: int) -> Tracks:
+    found = parallel.each(lambda position: features.detect(working.grey[position], working.usable), positions)
+    detected = dict(zip(positions, found, strict=True))
     offset = dict(zip(positions, np.cumsum([0, *(len(detected[p].points) for p in positions)]), strict=False))
     total = sum(len(found.points) for found in detected.values())
     parent = np.arange(total)
@@ -248,8 +289,7 @@ def _track(a: GreyImage, b: GreyImage, pixels: Points, guess: Points) -> tuple[P
 
     half = len(pixels) // 2
     halves = [some for some in (slice(0, half), slice(half, None)) if len(pixels[some])]
-    with ThreadPoolExecutor(2) as pool:  # no point's track depends on another's
-        parts = list(pool.map(there_and_back, halves))
+    parts = parallel.each(there_and_back, halves)  # no point's track depends on another's
     moved, found, back, returned = (np.concatenate([part[k] for part in parts]) for k in range(4))
     close = np.linalg.norm(back - pixels, axis=1) < _ROUND_TRIP_PX
     return np.asarray(moved, dtype=np.float32), np.asarray(
