@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from vggt_motion.errors import VggtMotionError
 
 _log = logging.getLogger(__name__)
-_POLL_S = 0.05
+_POLL_S = 0.2
 _context = multiprocessing.get_context("spawn")
 Result = TypeVar("Result")
 
@@ -88,7 +88,7 @@ class ComputeChild:
             function: importable by name; it and its arguments cross a pipe between our own two processes.
             args: positional arguments.
             deadline_s: seconds of wall clock that the call may take.
-            on_tick: called about twenty times a second from the calling thread; returning False cancels, and so does
+            on_tick: called about five times a second from the calling thread; returning False cancels, and so does
                 an exception, which is passed on.
 
         Raises:

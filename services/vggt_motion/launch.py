@@ -25,13 +25,14 @@ from vggt_motion.errors import BusError, BusUnavailableError, InputError, VggtMo
 from vggt_motion.gateway.security import check_exposure
 from vggt_motion.inference.registry import choose_predictor
 from vggt_motion.ledger.sessions import SessionIdentity
-from vggt_motion.records import HealthReport, MotionState, Stream
+from vggt_motion.records import MotionState, Stream
 from vggt_motion.sources.registry import open_source
 from vggt_motion.sources.source import Source
 from vggt_motion.supervise import ServiceCommand, Supervisor
 
 _log = logging.getLogger(__name__)
 _TICK_S = 0.05
+_SUPERVISE_S = 0.25
 _STATUS_INTERVAL_S = 0.5
 _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
@@ -323,7 +324,7 @@ class LocalRun:
                     if now - finished_at > _RECORDER_TIMEOUT_S:
                         _log.warning("the recorder did not catch up in time; the recording may lack its end")
                         break
-                time.sleep(_TICK_S)
+                follower.wait(_SUPERVISE_S)
             if self._interrupts:
                 _take_in_rest(follower, state, LedgerClient(bus))
             on_progress(self._progress(state, watch))
@@ -332,7 +333,7 @@ class LocalRun:
         return state
 
     def _progress(self, state: LogState, watch: ServiceWatch) -> Progress:
-        frontend = _newest(watch, "frontend")
+        frontend = watch.newest_report("frontend")
         counters = frontend.counters if frontend is not None else {}
         newest = max(state.keyframes.values(), key=lambda keyframe: keyframe.frame_index, default=None)
         predicted = {index for index, _ in state.submaps}
@@ -365,7 +366,7 @@ def _supervised(supervisor: Supervisor, bus: Bus) -> Iterator[None]:
     failure: list[VggtMotionError] = []
 
     def watch() -> None:
-        while not is_over.wait(_TICK_S):
+        while not is_over.wait(_SUPERVISE_S):
             try:
                 supervisor.poll()
             except VggtMotionError as error:
@@ -396,7 +397,7 @@ class _RecorderProgress:
     def is_complete(self, state: LogState, positions: Mapping[Stream, int], now: float) -> bool:
         if not self._is_enabled:
             return True
-        report = _newest(self._watch, "recorder")
+        report = self._watch.newest_report("recorder")
         if report is None:
             self._frame_count = -1.0
             return False
@@ -429,8 +430,3 @@ def _take_in_rest(follower: LogFollower, state: LogState, ledger: LedgerClient) 
         if all(wanted.get(stream.value, 0) <= position for stream, position in follower.positions().items()):
             return
         time.sleep(_TICK_S)
-
-
-def _newest(watch: ServiceWatch, service: str) -> HealthReport | None:
-    reports = [report for (name, _), report in watch.services().items() if name == service and report is not None]
-    return max(reports, key=lambda report: report.time_ns, default=None)

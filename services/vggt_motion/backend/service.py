@@ -13,15 +13,15 @@ import time
 from vggt_motion.backend import live, planner, posegraph
 from vggt_motion.backend.state import LogState
 from vggt_motion.bus import codec
-from vggt_motion.bus.log import LogFollower
+from vggt_motion.bus.log import LogFollower, LogRecord
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.compute import ComputeCancelledError, ComputeChild
 from vggt_motion.config import Config
 from vggt_motion.errors import BusUnavailableError, DiskFullError, RequestRefusedError, VggtMotionError
-from vggt_motion.records import Constraint, GraphUpdate, Job, JobKind, Stream
+from vggt_motion.records import Constraint, GraphUpdate, Job, JobKind, Keyframe, Segment, Stream
 
 _log = logging.getLogger(__name__)
-_IDLE_S = 0.05
+_IDLE_S = 0.25
 _RETRY_S = 0.5
 _MAX_SOLVE_FAILURES = 3
 
@@ -40,6 +40,8 @@ class _Backend:
         self._child = ComputeChild("backend")
         self._live = live.LiveFeed()
         self._submitted: set[str] = set()
+        self._is_complete = False
+        self._awaited: set[str] = set()  # keyframes that a segment names and that have not come
         self._has_unsubmitted = False
         self._retry_at = 0.0
         self._solved_inputs = -1  # how many submaps and constraints the newest graph was solved from
@@ -50,7 +52,7 @@ class _Backend:
             self._child.start()  # its imports take longer than the first submap should wait for
             while not self._context.stopping.is_set():
                 if not self._pump() and not self._solve():
-                    self._context.stopping.wait(_IDLE_S)
+                    self._log.wait(_IDLE_S)
         except ComputeCancelledError:
             return
         finally:
@@ -60,15 +62,35 @@ class _Backend:
     def _pump(self) -> bool:
         """Take in what is new in the log and submit what it calls for; whether anything was new."""
         records = self._log.poll()
-        for record in records:
-            self._state.apply(record)
-        if records or (self._has_unsubmitted and time.monotonic() >= self._retry_at):
+        is_planned = [self._apply(record) for record in records]
+        if any(is_planned) or (self._has_unsubmitted and time.monotonic() >= self._retry_at):
             self._submit()
+        if records:
             self._report()
         return bool(records)
 
+    def _apply(self, record: LogRecord) -> bool:
+        """Take in one record; whether the plan may change by it: most are keyframes that no segment names yet."""
+        state = self._state
+        state.apply(record)
+        match record:
+            case Keyframe():
+                was_awaited = record.keyframe_id in self._awaited
+                self._awaited.discard(record.keyframe_id)
+                return was_awaited
+            case Segment():
+                named = (*record.overlap_keyframe_ids, *record.base_keyframe_ids)
+                self._awaited.update(name for name in named if name not in state.keyframes)
+            case GraphUpdate():
+                return False
+            case _:
+                pass
+        return True
+
     def _submit(self) -> None:
-        planned = [job for job in planner.next_jobs(self._state, self._config) if job.job_id not in self._submitted]
+        called_for = planner.next_jobs(self._state, self._config)
+        self._is_complete = not called_for and planner.is_complete(self._state, self._config)
+        planned = [job for job in called_for if job.job_id not in self._submitted]
         self._has_unsubmitted = bool(planned)
         if not planned:
             return
@@ -111,7 +133,7 @@ class _Backend:
         graph = state.latest_graph()
         if graph is not None and graph.is_final:
             return False
-        is_final = planner.is_complete(state, self._config)
+        is_final = self._is_complete
         inputs = state.graph_input_count
         if not is_final and (inputs == 0 or inputs <= max(self._solved_inputs, graph.revision if graph else -1)):
             return False
@@ -125,7 +147,7 @@ class _Backend:
             _log.error("the pose graph was not solved", extra={"reason": str(error), "final": is_final})
             if self._solve_failures >= _MAX_SOLVE_FAILURES:
                 raise
-            time.sleep(_IDLE_S)
+            self._context.stopping.wait(_RETRY_S)
             return True
         self._solve_failures = 0
         self._solved_inputs = inputs

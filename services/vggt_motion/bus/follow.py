@@ -7,9 +7,11 @@ buffer) is read from the ledger, so that what comes out is dense and in order wh
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -20,7 +22,7 @@ from vggt_motion.errors import BusUnavailableError, CodecError, LedgerError, Vgg
 from vggt_motion.records import LogEntry
 
 _log = logging.getLogger(__name__)
-_POLL_S = 2.0  # a lost last message shows up after this at the latest
+POLL_S = 2.0  # a lost last message shows up after this at the latest
 _GAP_PATIENCE_S = 0.05  # a gap may close by itself: live messages can overtake the answer to a read
 _RETRY_S = 0.25
 _BUFFER_COUNT = 256
@@ -40,7 +42,15 @@ class Followed(Generic[FollowedRecord]):
 class Follower(Generic[FollowedRecord]):
     """Delivers the records of one stream, dense and in order. One thread may take from it."""
 
-    def __init__(self, bus: Bus, stream: str, cls: type[FollowedRecord], *, from_sequence: int = 0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        stream: str,
+        cls: type[FollowedRecord],
+        *,
+        from_sequence: int = 0,
+        on_news: Callable[[], None] | None = None,
+    ) -> None:
         """Start to follow.
 
         Args:
@@ -48,12 +58,17 @@ class Follower(Generic[FollowedRecord]):
             stream: its name.
             cls: the record that it holds.
             from_sequence: first to deliver.
+            on_news: None: it listens and asks for itself. Else somebody does both for several streams, with
+                :meth:`offer` and :meth:`expect`, and is called whenever there is something to take; must not block.
         """
         self._ledger = LedgerClient(bus)
         self._bus = bus
         self._stream = str(stream)
         self._class = cls
-        self._changed = threading.Condition()
+        self._on_news = on_news
+        lock = threading.RLock()
+        self._changed = threading.Condition(lock)  # for who takes
+        self._work = threading.Condition(lock)  # for our thread
         self._fetched = from_sequence  # sequence number of the next entry to put into the buffer
         self._live: dict[int, LogEntry] = {}  # ahead of the cursor
         self._buffer: deque[Followed[FollowedRecord]] = deque()
@@ -61,9 +76,10 @@ class Follower(Generic[FollowedRecord]):
         self._end = 0
         self._live_end = 0  # of what was published since the last read was sent
         self._skipped_count = 0
+        self._is_doubted = True  # the ledger is to be asked whatever was published
         self._failure: VggtMotionError | None = None
         self._is_closed = False
-        self._subscription = bus.subscribe(bus.keys.log(self._stream), self._on_sample)
+        self._subscription = bus.subscribe(bus.keys.log(self._stream), self._on_sample) if on_news is None else None
         self._thread = threading.Thread(target=self._run, name=f"follow {stream}", daemon=True)
         self._thread.start()
 
@@ -97,8 +113,30 @@ class Follower(Generic[FollowedRecord]):
                 return None
             followed = self._buffer.popleft()
             self._position = followed.sequence + 1
-            self._changed.notify_all()
+            self._take_live()
+            if self._needs_read():
+                self._work.notify()
             return followed
+
+    def offer(self, entry: LogEntry) -> None:
+        """Take in what was published; from any thread."""
+        with self._changed:
+            self._end = max(self._end, entry.sequence + 1)
+            self._live_end = max(self._live_end, entry.sequence + 1)
+            # Bounded: what does not fit is read later.
+            if entry.stream == self._stream and entry.sequence >= self._fetched and len(self._live) < _BUFFER_COUNT:
+                self._live[entry.sequence] = entry
+                self._take_live()
+            if self._needs_read():
+                self._work.notify()
+
+    def expect(self, end: int) -> None:
+        """The ledger says that the stream has so many records; from any thread."""
+        with self._changed:
+            self._end = max(self._end, end)
+            self._is_doubted |= end < self._fetched
+            if self._is_doubted or self._needs_read():
+                self._work.notify()
 
     def close(self) -> None:
         """Stop following."""
@@ -107,41 +145,36 @@ class Follower(Generic[FollowedRecord]):
                 return
             self._is_closed = True
             self._changed.notify_all()
-        self._subscription.close()
+            self._work.notify_all()
+        if self._subscription is not None:
+            self._subscription.close()
         self._thread.join(_JOIN_S)
 
     def _on_sample(self, sample: Sample) -> None:
-        try:
-            entry = codec.decode(LogEntry, sample.payload)
-        except CodecError as error:
-            _log.warning("not a log entry, passed over", extra={"key": sample.key, "reason": str(error)})
-            return
-        with self._changed:
-            self._end = max(self._end, entry.sequence + 1)
-            self._live_end = max(self._live_end, entry.sequence + 1)
-            # Bounded: what does not fit is read later.
-            if entry.stream == self._stream and entry.sequence >= self._fetched and len(self._live) < _BUFFER_COUNT:
-                self._live[entry.sequence] = entry
-            self._changed.notify_all()
+        entry = published_entry(sample)
+        if entry is not None:
+            self.offer(entry)
 
     def _run(self) -> None:
-        next_poll = 0.0
+        next_poll = math.inf if self._on_news is not None else 0.0
         while True:
             with self._changed:
-                self._take_live()
-                if not self._is_closed and not (self._needs_read() or time.monotonic() >= next_poll):
-                    self._changed.wait(max(0.0, next_poll - time.monotonic()))
+                is_due = self._is_doubted or self._needs_read() or time.monotonic() >= next_poll
+                if not (self._is_closed or is_due):
+                    self._work.wait(None if next_poll == math.inf else max(0.0, next_poll - time.monotonic()))
                     continue
                 if not self._is_closed and len(self._buffer) >= _BUFFER_COUNT:
-                    self._changed.wait(_POLL_S)
+                    self._work.wait(POLL_S)
                     continue
                 if self._needs_read() and self._live:
-                    self._changed.wait(_GAP_PATIENCE_S)
-                    self._take_live()
+                    self._work.wait(_GAP_PATIENCE_S)
+                    if not (self._is_closed or self._is_doubted or self._needs_read()):
+                        continue
                 if self._is_closed:
                     return
                 position = self._fetched
                 self._live_end = 0
+                self._is_doubted = False
             try:
                 page = self._ledger.page(self._stream, position, _BUFFER_COUNT)
                 if page.next_sequence < position:
@@ -152,6 +185,8 @@ class Follower(Generic[FollowedRecord]):
                 if not page.entries and page.next_sequence > position:
                     raise BusUnavailableError(f"stream {self._stream}: the ledger gave none of its records")
             except BusUnavailableError:
+                with self._changed:
+                    self._is_doubted = True
                 if self._bus.wait(_RETRY_S):
                     self._fail(BusUnavailableError(f"stream {self._stream}: stopping"), is_final=False)
                     return
@@ -165,8 +200,10 @@ class Follower(Generic[FollowedRecord]):
                 # The ledger knows its end; a publication that claims more is believed for one read only.
                 self._end = max(self._fetched, page.next_sequence, self._live_end)
                 self._live = {number: entry for number, entry in self._live.items() if number < self._end}
-            is_behind = bool(page.entries) and self._fetched < page.next_sequence
-            next_poll = 0.0 if is_behind else time.monotonic() + _POLL_S
+                self._take_live()
+                self._is_doubted |= bool(page.entries) and self._fetched < page.next_sequence
+            if self._on_news is None:
+                next_poll = time.monotonic() + POLL_S
 
     def _needs_read(self) -> bool:
         """There are records beyond the cursor, and the next one is not among the live ones."""
@@ -191,6 +228,8 @@ class Follower(Generic[FollowedRecord]):
             return
         self._buffer.append(Followed(entry.sequence, record, entry))
         self._changed.notify_all()
+        if self._on_news is not None:
+            self._on_news()
 
     def _fail(self, error: VggtMotionError, *, is_final: bool) -> None:
         if is_final:
@@ -200,3 +239,14 @@ class Follower(Generic[FollowedRecord]):
                 self._failure = error
             self._is_closed = True
             self._changed.notify_all()
+            if self._on_news is not None:
+                self._on_news()
+
+
+def published_entry(sample: Sample) -> LogEntry | None:
+    """What a publication of the log holds; None, and a warning, where it is none."""
+    try:
+        return codec.decode(LogEntry, sample.payload)
+    except CodecError as error:
+        _log.warning("not a log entry, passed over", extra={"key": sample.key, "reason": str(error)})
+        return None

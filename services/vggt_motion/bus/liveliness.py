@@ -79,13 +79,18 @@ def announce(bus: Bus, service: str, instance: str, health: Callable[[], HealthR
 
 
 class ServiceWatch:
-    """All services of the session that are alive, with what they last said of themselves."""
+    """All services of the session that are alive, with what they last said of themselves.
+
+    Reports come once a second from each and are asked for seldom: they are decoded when they are.
+    """
 
     def __init__(self, bus: Bus) -> None:
         """Start to watch."""
         self._changed = threading.Condition()
         self._alive: set[tuple[str, str]] = set()
-        self._reports: dict[tuple[str, str], tuple[HealthReport, float]] = {}  # with the monotonic time of arrival
+        # With the monotonic time of arrival.
+        self._reports: dict[tuple[str, str], tuple[HealthReport, float]] = {}
+        self._unread: dict[tuple[str, str], tuple[bytes, float]] = {}
         self._subscriptions: list[Closable] = [
             bus.watch_liveliness(bus.keys.all_alive(), self._on_token),
             bus.subscribe(bus.keys.all_health(), self._on_health),
@@ -94,12 +99,21 @@ class ServiceWatch:
     def services(self) -> dict[tuple[str, str], HealthReport | None]:
         """(service, instance) -> last report, None before the first one; sorted."""
         with self._changed:
+            self._read()
             last = {name: report for name, (report, _) in self._reports.items()}
             return {name: last.get(name) for name in sorted(self._alive)}
+
+    def newest_report(self, service: str) -> HealthReport | None:
+        """The last report of any living instance of a service."""
+        with self._changed:
+            self._read(service)
+            reports = [self._reports[name][0] for name in self._alive & self._reports.keys() if name[0] == service]
+            return max(reports, key=lambda report: report.time_ns, default=None)
 
     def silence_s(self, service: str, instance: str) -> float | None:
         """Seconds since the last report arrived, by our clock; None if none did."""
         with self._changed:
+            self._read(service)
             known = self._reports.get((service, instance))
             return None if known is None else time.monotonic() - known[1]
 
@@ -112,6 +126,7 @@ class ServiceWatch:
         """The first report of any instance of a service, or None if none comes in time."""
 
         def newest() -> HealthReport | None:
+            self._read(service)
             reports = [report for (name, _), (report, _) in self._reports.items() if name == service]
             return max(reports, key=lambda report: report.time_ns, default=None)
 
@@ -138,22 +153,30 @@ class ServiceWatch:
             if not is_alive:
                 self._alive.discard(name)
                 self._reports.pop(name, None)
+                self._unread.pop(name, None)
             elif len(self._alive) < _MAX_SERVICES:
                 self._alive.add(name)
             self._changed.notify_all()
 
     def _on_health(self, sample: Sample) -> None:
-        try:
-            report = codec.decode(HealthReport, sample.payload)
-        except CodecError as error:
-            _log.warning("not a health report, passed over", extra={"key": sample.key, "reason": str(error)})
-            return
         name = service_of(sample.key)
-        if (report.service, report.instance) != name:
-            _log.warning("health under another's name, passed over", extra={"key": sample.key})
-            return
         with self._changed:
             # The token decides who is alive, but health may overtake it.
-            if name in self._reports or len(self._reports) < _MAX_SERVICES:
-                self._reports[name] = (report, time.monotonic())
+            if name in self._unread or len(self._unread) < _MAX_SERVICES:
+                self._unread[name] = (sample.payload, time.monotonic())
             self._changed.notify_all()
+
+    def _read(self, service: str | None = None) -> None:
+        """Decode what has come since the last time, of one service or of all."""
+        for name in [name for name in self._unread if service is None or name[0] == service]:
+            payload, arrived_at = self._unread.pop(name)
+            who = "/".join(name)
+            try:
+                report = codec.decode(HealthReport, payload)
+            except CodecError as error:
+                _log.warning("not a health report, passed over", extra={"of": who, "reason": str(error)})
+                continue
+            if (report.service, report.instance) != name:
+                _log.warning("health under another's name, passed over", extra={"of": who})
+            elif name in self._reports or len(self._reports) < _MAX_SERVICES:
+                self._reports[name] = (report, arrived_at)

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from vggt_motion.bus.follow import Follower
-from vggt_motion.bus.session import Bus
-from vggt_motion.records import Constraint, Event, GraphUpdate, Keyframe, Segment, Stream, SubmapGeometry
+import logging
+import threading
+from collections.abc import Callable, Mapping
 
+from vggt_motion.bus.follow import POLL_S, Follower, published_entry
+from vggt_motion.bus.keys import last_chunk
+from vggt_motion.bus.ledger import LedgerClient
+from vggt_motion.bus.session import Bus, Sample
+from vggt_motion.errors import BusUnavailableError, VggtMotionError
+from vggt_motion.records import Constraint, Event, GraphUpdate, Keyframe, LedgerStatus, Segment, Stream, SubmapGeometry
+
+_log = logging.getLogger(__name__)
+_RETRY_S = 0.25
+_JOIN_S = 1.0
 LogRecord = Keyframe | Segment | SubmapGeometry | Constraint | GraphUpdate | Event
 
 RECORD_OF_STREAM: dict[Stream, type[LogRecord]] = {
@@ -19,27 +29,84 @@ RECORD_OF_STREAM: dict[Stream, type[LogRecord]] = {
 
 
 class LogFollower:
-    """Follows every stream from its beginning; records of one stream come in order, the streams are independent."""
+    """Follows every stream; records of one stream come in order, the streams are independent."""
 
-    def __init__(self, bus: Bus) -> None:
-        """Start to follow."""
-        self._followers = {stream: Follower(bus, stream, cls) for stream, cls in RECORD_OF_STREAM.items()}
-        self._positions = dict.fromkeys(RECORD_OF_STREAM, 0)
+    def __init__(
+        self,
+        bus: Bus,
+        positions: Mapping[Stream, int] | None = None,
+        *,
+        on_status: Callable[[LedgerStatus | None], None] | None = None,
+    ) -> None:
+        """Start to follow.
+
+        Args:
+            bus: joined.
+            positions: first record to deliver of each stream; 0 where it names none.
+            on_status: told what the ledger says of itself whenever it was asked; None: it did not answer. Called from
+                a thread of ours.
+        """
+        self._ledger = LedgerClient(bus)
+        self._on_status = on_status
+        self._news = threading.Event()
+        self._closing = threading.Event()
+        first = positions or {}
+        self.followers: dict[Stream, Follower[LogRecord]] = {
+            stream: Follower(bus, stream, cls, from_sequence=first.get(stream, 0), on_news=self._news.set)
+            for stream, cls in RECORD_OF_STREAM.items()
+        }
+        self._by_name = {stream.value: follower for stream, follower in self.followers.items()}
+        self._subscription = bus.subscribe(bus.keys.all_logs(), self._on_sample)
+        self._thread = threading.Thread(target=self._watch, name="watch the log", daemon=True)
+        self._thread.start()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for something to take; whether there may be."""
+        has_news = self._news.wait(timeout_s)
+        # Before it is taken: what comes in between is announced again.
+        self._news.clear()
+        return has_news
 
     def poll(self) -> list[LogRecord]:
         """What is new since the last call; does not wait."""
         records: list[LogRecord] = []
-        for stream, follower in self._followers.items():
+        for follower in self.followers.values():
             while (followed := follower.next(0.0)) is not None:
                 records.append(followed.record)
-                self._positions[stream] = followed.sequence + 1
         return records
 
     def positions(self) -> dict[Stream, int]:
-        """How many records of each stream were delivered."""
-        return dict(self._positions)
+        """Of each stream, the sequence number of the record that is delivered next."""
+        return {stream: follower.position for stream, follower in self.followers.items()}
 
     def close(self) -> None:
         """Stop following."""
-        for follower in self._followers.values():
+        self._closing.set()
+        self._subscription.close()
+        for follower in self.followers.values():
             follower.close()
+        self._thread.join(_JOIN_S)
+
+    def _on_sample(self, sample: Sample) -> None:
+        follower = self._by_name.get(last_chunk(sample.key))
+        entry = published_entry(sample) if follower is not None else None
+        if follower is not None and entry is not None:
+            follower.offer(entry)
+
+    def _watch(self) -> None:
+        """Ask the ledger for the ends of all streams now and then: a publication may be lost."""
+        wait_s = 0.0
+        while not self._closing.wait(wait_s):
+            wait_s = POLL_S
+            status: LedgerStatus | None = None
+            try:
+                status = self._ledger.status()
+            except BusUnavailableError:
+                wait_s = _RETRY_S
+            except VggtMotionError as error:
+                _log.warning("the ledger does not say how long the log is", extra={"reason": str(error)})
+            if self._on_status is not None:
+                self._on_status(status)
+            if status is not None:
+                for name, follower in self._by_name.items():
+                    follower.expect(status.position(name))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import socket
 import threading
@@ -10,23 +11,23 @@ import time
 import uvicorn
 from fastapi import FastAPI
 
-from vggt_motion.bus.follow import Follower
 from vggt_motion.bus.liveliness import ServiceWatch
-from vggt_motion.bus.log import RECORD_OF_STREAM, LogRecord
+from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.config import Config, GatewayConfig
-from vggt_motion.errors import BusError, ConfigurationError, VggtMotionError
+from vggt_motion.errors import ConfigurationError, VggtMotionError
 from vggt_motion.gateway.app import create_app
 from vggt_motion.gateway.security import check_exposure
 from vggt_motion.gateway.state import GatewayState
-from vggt_motion.records import BlobRef, Stream
+from vggt_motion.records import BlobRef
 
 _log = logging.getLogger(__name__)
-_POLL_S = 0.05
+_IDLE_S = 0.25
 _STATUS_INTERVAL_S = 1.0
 _BLOB_PATIENCE_S = 3.0
 _RECORDS_A_TURN = 500
 _SHUTDOWN_S = 1.0
+_HTTP_TICK_S = 0.25
 
 
 def main(config: Config) -> int:
@@ -76,16 +77,13 @@ class _Gateway:
         host, port = listener.getsockname()[:2]
         self._port = port
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        self._state = GatewayState(context.config, read_blob=self._read_blob)
+        self._watch = ServiceWatch(context.bus)
+        self._state = GatewayState(context.config, read_blob=self._read_blob, look_at_services=self._look_at_services)
         self._app = create_app(self._state, context.config.gateway)
 
     def serve(self) -> None:
         context = self._context
-        watch = ServiceWatch(context.bus)
-        followers: dict[Stream, Follower[LogRecord]] = {
-            stream: Follower(context.bus, stream, cls) for stream, cls in RECORD_OF_STREAM.items()
-        }
-        threading.Thread(target=self._watch_ledger, name="gateway-ledger", daemon=True).start()
+        log = LogFollower(context.bus, on_status=self._state.set_ledger)
         server = HttpServer(self._app, self._listener)
         server.start()
         _log.info("serving", extra={"url": self.url})
@@ -94,25 +92,23 @@ class _Gateway:
             while not context.stopping.is_set():
                 if not server.is_alive:
                     raise VggtMotionError("the HTTP server ended by itself; its log has the reason")
-                count = self._take_in(followers)
+                count = self._take_in(log)
                 if time.monotonic() >= next_report:
                     next_report = time.monotonic() + _STATUS_INTERVAL_S
-                    self._take_services(watch)
-                    self._report(followers)
+                    self._report(log)
                 if count == 0:
-                    context.stopping.wait(_POLL_S)
+                    log.wait(_IDLE_S)
         finally:
             # Live clients first: the server waits for open answers.
             self._state.hub.close()
             server.stop()
-            for follower in followers.values():
-                follower.close()
-            watch.close()
+            log.close()
+            self._watch.close()
 
-    def _take_in(self, followers: dict[Stream, Follower[LogRecord]]) -> int:
+    def _take_in(self, log: LogFollower) -> int:
         """Apply what has come, a bounded number of records a turn, so that no stream starves another."""
         count = 0
-        for stream, follower in followers.items():
+        for stream, follower in log.followers.items():
             for _ in range(_RECORDS_A_TURN):
                 followed = follower.next(0.0)
                 if followed is None:
@@ -121,7 +117,7 @@ class _Gateway:
                 count += 1
         return count
 
-    def _report(self, followers: dict[Stream, Follower[LogRecord]]) -> None:
+    def _report(self, log: LogFollower) -> None:
         hub = self._state.hub
         self._context.set_health(
             "working",
@@ -129,23 +125,14 @@ class _Gateway:
             port=self._port,
             live_clients=hub.client_count,
             missed_events=hub.dropped_count,
-            skipped_records=sum(follower.skipped_count for follower in followers.values()),
-            **{f"position_{stream.value}": follower.position for stream, follower in followers.items()},
+            skipped_records=sum(follower.skipped_count for follower in log.followers.values()),
+            **{f"position_{stream.value}": position for stream, position in log.positions().items()},
         )
 
-    def _take_services(self, watch: ServiceWatch) -> None:
-        services = watch.services()
-        silences = {name: silence for name in services if (silence := watch.silence_s(*name)) is not None}
+    def _look_at_services(self) -> None:
+        services = self._watch.services()
+        silences = {name: silence for name in services if (silence := self._watch.silence_s(*name)) is not None}
         self._state.set_services(services, silences)
-
-    def _watch_ledger(self) -> None:
-        """Ask the ledger how it is: beside everything else, which must not wait for a ledger that is silent."""
-        while not self._context.stopping.is_set():
-            try:
-                self._state.set_ledger(self._context.ledger.status())
-            except BusError:
-                self._state.set_ledger(None)
-            self._context.stopping.wait(_STATUS_INTERVAL_S)
 
     def _read_blob(self, ref: BlobRef) -> bytes:
         return self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)
@@ -157,7 +144,7 @@ class HttpServer:
     def __init__(self, app: FastAPI, listener: socket.socket) -> None:
         """Prepare; nothing is served yet."""
         self._listener = listener
-        self._server = uvicorn.Server(
+        self._server = _HttpLoop(
             uvicorn.Config(
                 app,
                 log_config=None,
@@ -188,6 +175,13 @@ class HttpServer:
 
     def _run(self) -> None:
         self._server.run(sockets=[self._listener])
+
+
+class _HttpLoop(uvicorn.Server):
+    async def main_loop(self) -> None:
+        # As uvicorn's own, which wakes up ten times a second; 0 renews the date that answers carry.
+        while not await self.on_tick(0):
+            await asyncio.sleep(_HTTP_TICK_S)
 
 
 def _reason(error: Exception) -> str:

@@ -76,6 +76,7 @@ class GatewayState:
         config: Config,
         hub: EventHub | None = None,
         read_blob: Callable[[BlobRef], bytes] | None = None,
+        look_at_services: Callable[[], None] | None = None,
     ) -> None:
         """Know nothing yet.
 
@@ -83,9 +84,11 @@ class GatewayState:
             config: of the run.
             hub: those who listen.
             read_blob: fetches a payload of the ledger, from any thread; the map needs it.
+            look_at_services: calls :meth:`set_services` with how they are now, from any thread; called for each status.
         """
         self.config = config
         self.read_blob = read_blob
+        self._look_at_services = look_at_services
         self.hub = hub if hub is not None else EventHub()
         self._lock = threading.Lock()
         self._log = LogState()
@@ -172,6 +175,8 @@ class GatewayState:
 
     def status(self) -> StatusAnswer:
         """Everything that there is to say."""
+        if self._look_at_services is not None:
+            self._look_at_services()
         now = time.monotonic()
         with self._lock:
             return StatusAnswer(

@@ -16,9 +16,9 @@ from vggt_motion.backend.session_map import build_session_map
 from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import compose
 from vggt_motion.bus import codec
-from vggt_motion.bus.follow import Followed, Follower
+from vggt_motion.bus.follow import Followed
 from vggt_motion.bus.images import decode_image
-from vggt_motion.bus.log import RECORD_OF_STREAM, LogRecord
+from vggt_motion.bus.log import RECORD_OF_STREAM, LogFollower, LogRecord
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.bus.session import Sample
 from vggt_motion.config import Config
@@ -46,7 +46,7 @@ from vggt_motion.sources.source import Frame
 
 _log = logging.getLogger(__name__)
 RECORDING_FILE = "run.mcap"
-_POLL_S = 0.05
+_IDLE_S = 0.25
 _REPORT_S = 0.5
 _RECORDS_A_TURN = 100
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
@@ -89,15 +89,13 @@ class _Recorder:
         self._take_up()
         # Over a link of its own: a slow disk then holds up whoever publishes blocking, and not our own requests.
         images = context.bus.subscribe(context.bus.keys.all_images(), self._on_image, history=True, isolated=True)
-        followers: dict[Stream, Follower[LogRecord]] = {
-            stream: Follower(context.bus, stream, cls, from_sequence=self._recording.position(stream.value))
-            for stream, cls in RECORD_OF_STREAM.items()
-        }
+        positions = {stream: self._recording.position(stream.value) for stream in RECORD_OF_STREAM}
+        follower = LogFollower(context.bus, positions)
         self._views.start()
         try:
             next_report, was_complete = 0.0, False
             while not context.stopping.is_set():
-                count = self._follow(followers)
+                count = self._follow(follower)
                 self._fill_keyframes()
                 self._check()
                 is_complete = self._is_complete
@@ -106,14 +104,13 @@ class _Recorder:
                     # a change of state is sent at once: whoever waits for the recording waits no longer than it takes
                     self._report("idle" if is_complete else "working")
                 if count == 0:
-                    context.stopping.wait(_POLL_S)
-            self._follow(followers, keep_going=False)
+                    follower.wait(_IDLE_S)
+            self._follow(follower, keep_going=False)
         except OSError as error:
             self._failure = error
         finally:
             images.close()
-            for follower in followers.values():
-                follower.close()
+            follower.close()
             self._finish()
 
     def _finish(self) -> None:
@@ -200,10 +197,10 @@ class _Recorder:
 
     # --- records ---
 
-    def _follow(self, followers: dict[Stream, Follower[LogRecord]], *, keep_going: bool = True) -> int:
+    def _follow(self, log: LogFollower, *, keep_going: bool = True) -> int:
         """Write what has come, a bounded number of records a turn; returns how many."""
         count = 0
-        for stream, follower in followers.items():
+        for stream, follower in log.followers.items():
             for _ in range(_RECORDS_A_TURN):
                 followed = self._held.pop(stream, None) or follower.next(0.0)
                 if followed is None or (keep_going and self._context.stopping.is_set()):
