@@ -8,8 +8,6 @@ version. What each message may hold stands in ``contract``.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
 from typing import Any, Final, TypeAlias, TypeVar
 
 from google.protobuf.message import DecodeError, EncodeError, Message
@@ -36,6 +34,7 @@ __all__ = [
     "decode_depth",
     "encode",
     "encode_depth",
+    "encode_with_identity",
     "encoding_of",
     "identity_digest",
     "payload_type",
@@ -70,7 +69,22 @@ def encode(record: Any) -> bytes:
         CodecError: a value breaks a rule of the wire; the message names the field.
     """
     plan = _plan_of(type(record))
-    return _serialise(_message(plan, record), plan)
+    if not plan.has_bulk:
+        return _serialise(_message(plan, record), plan)
+    try:
+        pieces = plan.pieces(record, _empty(plan))
+    except FieldError as error:
+        raise _codec_error(plan, error) from None
+    except (EncodeError, ValueError) as error:
+        raise CodecError(f"{plan.full_name}: cannot be serialised: {_one_line(error)}") from None
+    return _bounded(b"".join(pieces), plan)
+
+
+def encode_with_identity(record: Any) -> tuple[bytes, bytes]:
+    """:func:`encode` and :func:`identity_digest` of a record in one go."""
+    plan = _plan_of(type(record))
+    message = _message(plan, record)
+    return _serialise(message, plan), _identity(message, plan)
 
 
 def decode(cls: type[_Message], payload: bytes) -> _Message:
@@ -80,8 +94,7 @@ def decode(cls: type[_Message], payload: bytes) -> _Message:
         CodecError: one line that names the type and the field that is wrong.
     """
     plan = _plan_of(cls)
-    if len(payload) > plan.max_bytes:
-        raise CodecError(f"{plan.full_name}: {len(payload)} bytes are more than the allowed {plan.max_bytes}")
+    _bounded(payload, plan)
     check_structure(payload, plan.message.DESCRIPTOR)
     message = plan.message()
     try:
@@ -128,10 +141,7 @@ def identity_digest(record: Any) -> bytes:
     compares, to which payloads are opaque.
     """
     plan = _plan_of(type(record))
-    message = _message(plan, record)
-    for name in plan.informative:
-        message.ClearField(name)
-    return hashlib.sha256(plan.full_name.encode() + b"\0" + _serialise(message, plan)).digest()
+    return _identity(_message(plan, record), plan)
 
 
 def blob_ref(content: bytes, media_type: str) -> BlobRef:
@@ -141,18 +151,20 @@ def blob_ref(content: bytes, media_type: str) -> BlobRef:
 
 def blob_refs(record: Any) -> tuple[BlobRef, ...]:
     """Every blob that a record refers to, once, in order of appearance."""
-    return tuple(dict.fromkeys(_walk_blob_refs(record)))
+    found: list[BlobRef] = []
+    _gather_blob_refs(record, found)
+    return tuple(dict.fromkeys(found))
 
 
-def _walk_blob_refs(value: Any) -> Iterator[BlobRef]:
+def _gather_blob_refs(value: object, found: list[BlobRef]) -> None:
     if isinstance(value, BlobRef):
-        yield value
+        found.append(value)
     elif isinstance(value, tuple):
         for entry in value:
-            yield from _walk_blob_refs(entry)
-    elif is_dataclass(value):
-        for entry in fields(value):
-            yield from _walk_blob_refs(getattr(value, entry.name))
+            _gather_blob_refs(entry, found)
+    else:
+        for name in getattr(value, "__dataclass_fields__", ()):
+            _gather_blob_refs(getattr(value, name), found)
 
 
 def _plan_of(cls: type[Any]) -> Plan:
@@ -162,11 +174,16 @@ def _plan_of(cls: type[Any]) -> Plan:
 
 
 def _message(plan: Plan, record: Any) -> Message:
-    message = plan.message()
+    message = _empty(plan)
     try:
         plan.fill(message, record)
     except FieldError as error:
         raise _codec_error(plan, error) from None
+    return message
+
+
+def _empty(plan: Plan) -> Message:
+    message = plan.message()
     if plan.record in _VERSIONED:
         message.schema_version = SCHEMA_VERSION  # type: ignore[attr-defined]
     return message
@@ -177,6 +194,16 @@ def _serialise(message: Message, plan: Plan) -> bytes:
         payload = message.SerializeToString(deterministic=True)
     except (EncodeError, ValueError) as error:
         raise CodecError(f"{plan.full_name}: cannot be serialised: {_one_line(error)}") from None
+    return _bounded(payload, plan)
+
+
+def _identity(message: Message, plan: Plan) -> bytes:
+    for name in plan.informative:
+        message.ClearField(name)
+    return hashlib.sha256(plan.full_name.encode() + b"\0" + _serialise(message, plan)).digest()
+
+
+def _bounded(payload: bytes, plan: Plan) -> bytes:
     if len(payload) > plan.max_bytes:
         raise CodecError(f"{plan.full_name}: {len(payload)} bytes are more than the allowed {plan.max_bytes}")
     return payload

@@ -39,12 +39,13 @@ def append_request(stream: str, record_id: str, record: codec.Record, blobs: Seq
             continue
         if hashlib.sha256(blob).hexdigest() not in known:
             raise CodecError(f"{record_id}: a blob of {len(blob)} bytes is not referred to by the record")
+    payload, identity_sha256 = codec.encode_with_identity(record)
     return calls.AppendRequest(
         stream=str(stream),
         record_id=record_id,
         payload_type=codec.payload_type(type(record)),
-        payload=codec.encode(record),
-        identity_sha256=codec.identity_digest(record),
+        payload=payload,
+        identity_sha256=identity_sha256,
         blobs=tuple(blobs),
         blob_refs=refs,
     )

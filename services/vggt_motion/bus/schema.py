@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
@@ -57,6 +57,10 @@ class Rule:
     def collect(self, container: Any) -> list[Any]:
         """Read a repeated field."""
         return [self.check(value) for value in container]
+
+    def pieces(self, number: int, value: Any) -> list[bytes]:
+        """The field as it stands on the wire under this number, in pieces, without a copy of what is long."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,9 @@ class Raw(Rule):
             raise FieldError(f"has {len(value)} bytes, allowed are {self.min_bytes} to {self.max_bytes}")
         return value
 
+    def pieces(self, number: int, value: Any) -> list[bytes]:
+        return [_delimited(number, len(self.check(value))), value]
+
 
 class Choice(Rule):
     """A member of an enum; ``none_if_unspecified`` reads the zero value as None."""
@@ -230,6 +237,10 @@ class Sub(Rule):
                 raise error.at(f"[{index}]") from None
         return out
 
+    def pieces(self, number: int, value: Any) -> list[bytes]:
+        inner = self.plan.pieces(value, self.plan.message())
+        return [_delimited(number, sum(map(len, inner))), *inner]
+
 
 @dataclass(frozen=True)
 class OptionalText(Rule):
@@ -267,6 +278,12 @@ class Many(Rule):
         container = getattr(message, name)
         self._check_count(len(container))
         return tuple(self.rule.collect(container))
+
+    def pieces(self, number: int, value: Any) -> list[bytes]:
+        if not isinstance(value, tuple):
+            raise FieldError(f"must be a tuple, not {type(value).__name__}")
+        self._check_count(len(value))
+        return [piece for element in value for piece in self.rule.pieces(number, element)]
 
 
 @dataclass(frozen=True)
@@ -337,6 +354,7 @@ class Plan:
         *,
         test: Callable[[Any], str | None] = lambda _: None,
         informative: tuple[str, ...] = (),
+        bulk: str | None = None,
         max_bytes: int = 2**20,
     ) -> None:
         """Bind.
@@ -347,6 +365,7 @@ class Plan:
             rules: one for each field of ``record``.
             test: looks at the whole record and returns what is wrong with it, or None.
             informative: fields that are not part of the record's identity.
+            bulk: the field that may hold megabytes: it comes last on the wire, copied once.
             max_bytes: longest encoded message that is decoded at all.
         """
         names = {entry.name for entry in fields(record)}
@@ -358,18 +377,15 @@ class Plan:
         self.max_bytes = max_bytes
         self.full_name: str = message.DESCRIPTOR.full_name
         self._rules = tuple(rules.items())
+        self._head = tuple((name, rule) for name, rule in self._rules if name != bulk)
+        numbers = {entry.name: entry.number for entry in message.DESCRIPTOR.fields}
+        self._tail = tuple((name, numbers[name], rule) for name, rule in self._rules if name == bulk)
         self._test = test
+        self.has_bulk = bulk is not None
 
     def fill(self, message: Message, record: Any) -> None:
         """Move a record into an empty message."""
-        if not isinstance(record, self.record):
-            raise FieldError(f"must be a {self.record.__name__}, not {type(record).__name__}")
-        for name, rule in self._rules:
-            try:
-                rule.put(message, name, getattr(record, name))
-            except FieldError as error:
-                raise error.at(name) from None
-        self._check(record)
+        self._fill(message, record, self._rules)
 
     def read(self, message: Message) -> Any:
         """Make the record of a message."""
@@ -383,7 +399,44 @@ class Plan:
         self._check(record)
         return record
 
+    def pieces(self, record: Any, message: Message) -> list[bytes]:
+        """A record as bytes that are to be joined, by way of an empty message; equal records give equal bytes.
+
+        Raises:
+            FieldError: a value breaks a rule.
+            google.protobuf.message.EncodeError: what no rule forbids, but protobuf does.
+        """
+        self._fill(message, record, self._head)
+        pieces = [message.SerializeToString(deterministic=True)]
+        for name, number, rule in self._tail:
+            try:
+                pieces += rule.pieces(number, getattr(record, name))
+            except FieldError as error:
+                raise error.at(name) from None
+        return pieces
+
+    def _fill(self, message: Message, record: Any, rules: Iterable[tuple[str, Rule]]) -> None:
+        if not isinstance(record, self.record):
+            raise FieldError(f"must be a {self.record.__name__}, not {type(record).__name__}")
+        for name, rule in rules:
+            try:
+                rule.put(message, name, getattr(record, name))
+            except FieldError as error:
+                raise error.at(name) from None
+        self._check(record)
+
     def _check(self, record: Any) -> None:
         problem = self._test(record)
         if problem is not None:
             raise FieldError(problem)
+
+
+def _delimited(number: int, length: int) -> bytes:
+    """Tag and length of a field that is delimited by its length (protobuf, "Encoding")."""
+    out = bytearray()
+    for value in (number << 3 | 2, length):
+        while value > 0x7F:
+            out.append(value & 0x7F | 0x80)
+            value >>= 7
+        out.append(value)
+    return bytes(out)

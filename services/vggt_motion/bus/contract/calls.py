@@ -116,6 +116,7 @@ _APPEND_REQUEST = plan(
         "blobs": Many(Raw(MAX_BLOB_BYTES), 8192),
         "blob_refs": Many(Sub(BLOB_REF), 8192),
     },
+    bulk="blobs",
     max_bytes=MAX_CALL_BYTES,
 )
 
@@ -174,6 +175,7 @@ CALL_PLANS: Final[tuple[Plan, ...]] = (
         calls.DoneRequest,
         jobs_pb2.DoneRequest,
         rules={"job_id": IDENTIFIER, "lease_id": IDENTIFIER, "result": Sub(_APPEND_REQUEST)},
+        bulk="result",
         max_bytes=MAX_CALL_BYTES,
     ),
     plan(
