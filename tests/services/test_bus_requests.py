@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -105,20 +106,77 @@ def test_more_requests_than_threads_are_all_answered_each_once(endpoint: str) ->
     assert sorted(seen) == sorted(payloads)
 
 
-def test_handlers_run_in_at_most_so_many_threads_and_never_in_zenohs(endpoint: str) -> None:
+def test_at_most_so_many_handlers_run_at_a_time_and_never_in_zenohs_threads(endpoint: str) -> None:
     names: set[str] = set()
+    at_work: list[int] = []
+    counts: list[int] = []
     with connect(endpoint) as server, connect(endpoint) as client:
 
         def handler(_: str, payload: bytes) -> bytes:
-            names.add(f"{threading.current_thread().name} {threading.get_ident()}")
+            names.add(threading.current_thread().name)
+            at_work.append(1)
+            counts.append(len(at_work))
             time.sleep(0.01)
+            at_work.pop()
             return payload
 
         key = server.keys.rpc("test", "echo")
         server.serve(key, handler, threads=4)
         with ThreadPoolExecutor(16) as pool:
             list(pool.map(lambda _: client.request(key, b""), range(64)))
-    assert len(names) == 4 and all(name.startswith("serve ") for name in names)
+    assert max(counts) == 4 and names == {f"serve {key}"}
+
+
+def test_what_comes_while_others_are_answered_is_answered_together_and_each_for_itself(endpoint: str) -> None:
+    release = threading.Event()
+    batches: list[list[bytes]] = []
+
+    def handler(payloads: Sequence[bytes]) -> list[bytes | Exception]:
+        batches.append(list(payloads))
+        if payloads == [b"first"]:
+            assert release.wait(30)
+        return [RequestRefusedError("odd") if payload == b"odd" else payload for payload in payloads]
+
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "together")
+        served = server.serve_together(key, handler, at_a_time=8)
+        with ThreadPoolExecutor(32) as pool:
+            first = pool.submit(client.request, key, b"first")
+            wait_until(lambda: bool(batches))
+            others = [pool.submit(client.request, key, b"even" if index % 2 else b"odd") for index in range(20)]
+            wait_until(lambda: len(served._waiting) == 20)  # type: ignore[attr-defined]
+            assert not any(future.done() for future in others)
+            release.set()
+            assert first.result(30) == b"first"
+            for index, future in enumerate(others):
+                if index % 2:
+                    assert future.result(30) == b"even"
+                else:
+                    with pytest.raises(RequestRefusedError, match="odd"):
+                        future.result(30)
+    assert sum(map(len, batches)) == 21 and max(map(len, batches)) == 8
+
+
+def test_a_batch_ends_before_it_grows_too_large_and_a_defect_refuses_all_of_it(endpoint: str) -> None:
+    release = threading.Event()
+    batches: list[int] = []
+
+    def handler(payloads: Sequence[bytes]) -> list[bytes | Exception]:
+        batches.append(sum(map(len, payloads)))
+        assert release.wait(30)
+        raise ValueError("a defect")
+
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "together")
+        served = server.serve_together(key, handler, at_a_time=64)
+        with ThreadPoolExecutor(8) as pool:
+            asked = [pool.submit(client.request, key, bytes(3 * 2**20)) for _ in range(6)]
+            wait_until(lambda: len(served._waiting) == 5)  # type: ignore[attr-defined]
+            release.set()
+            for future in asked:
+                with pytest.raises(RequestRefusedError, match="internal error: ValueError"):
+                    future.result(30)
+    assert sum(batches) == 18 * 2**20 and max(batches) <= 8 * 2**20
 
 
 def test_a_wildcard_request_is_refused(endpoint: str) -> None:

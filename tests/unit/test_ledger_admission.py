@@ -88,8 +88,15 @@ def test_everything_else_is_refused_with_a_reason(change: dict[str, Any], reason
     assert "\n" not in str(caught.value)
 
 
+def append_one(desk: Desk, payload: bytes) -> bytes:
+    (outcome,) = desk.append([payload])
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
+
+
 ENTRIES: dict[str, Callable[[Desk, bytes], bytes]] = {
-    "append": Desk.append,
+    "append": append_one,
     "read": Desk.read,
     "status": Desk.answer_status,
     "submit": Desk.submit,
@@ -166,13 +173,12 @@ def test_damaged_requests_are_refused_or_still_mean_something(
 def test_refusals_are_counted(tmp_path: Path) -> None:
     ledger = open_session(tmp_path / "session", LedgerConfig(reserve_bytes=0))
     desk = Desk(ledger, lambda: None)
-    guarded = desk.guarded(lambda _, payload: desk.append(payload))
-    for payload in (b"", b"\xff", GOOD["append"][0]):
-        try:
-            guarded("key", payload)
-        except (CodecError, RequestRefusedError):
-            continue
+    outcomes = desk.append([b"", b"\xff", GOOD["append"][0]])
+    assert [type(outcome) for outcome in outcomes] == [CodecError, CodecError, bytes]
     assert desk.status().refused_request_count == 2
+    with pytest.raises(CodecError):
+        desk.guarded(lambda _, payload: desk.submit(payload))("key", b"\xff")
+    assert desk.status().refused_request_count == 3
     ledger.close()
 
 
@@ -180,9 +186,11 @@ def test_a_failing_store_is_unavailable_and_ends_the_service(tmp_path: Path) -> 
     ledger = open_session(tmp_path / "session", LedgerConfig(reserve_bytes=0))
     desk = Desk(ledger, lambda: None)
     ledger.rows.close()
-    guarded = desk.guarded(lambda _, payload: desk.append(payload))
+    assert [type(outcome) for outcome in desk.append(GOOD["append"][:2])] == [BusUnavailableError] * 2
+    assert isinstance(desk.failure, LedgerError)
+    desk.failure = None
     with pytest.raises(BusUnavailableError):
-        guarded("key", GOOD["append"][0])
+        desk.guarded(lambda _, payload: desk.submit(payload))("key", GOOD["submit"][0])
     assert isinstance(desk.failure, LedgerError)
     ledger.close()
 

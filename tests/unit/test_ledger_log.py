@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import sqlite3
 import threading
@@ -19,7 +20,7 @@ from vggt_motion.ledger import log, schema, sqlite
 from vggt_motion.ledger.blobs import BlobFiles
 from vggt_motion.ledger.check import check
 from vggt_motion.ledger.directory import Ledger, stored_blob
-from vggt_motion.ledger.log import Appended, is_intact
+from vggt_motion.ledger.log import Append, Appended, is_intact
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
 from vggt_motion.ledger.store import (
     BlobEntry,
@@ -290,20 +291,43 @@ def test_a_small_blob_and_its_record_share_one_commit(tmp_path: Path) -> None:
     ledger.close()
 
 
-def test_of_many_at_a_time_those_that_come_late_are_files(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
-    Gate(ledger.rows, waiting=15)
-    contents = [b"%d" % index for index in range(16)]
-    in_threads(
-        16,
-        lambda index: ledger.store.append(record("keyframe", f"{index}"), [contents[index]], [entry(contents[index])]),
+def test_of_several_at_a_time_each_stands_for_itself_in_one_commit(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=3)
+    ledger.store.append(record("keyframe", "first"))
+    gate = Gate(ledger.rows, waiting=0)
+    conflicting = dataclasses.replace(record("keyframe", "first"), identity_sha256=bytes(32))
+    outcomes = ledger.store.append_all(
+        [
+            Append(record("keyframe", "inline"), [b"abc"], [entry(b"abc")]),
+            Append(conflicting),
+            Append(record("keyframe", "file"), [b"long"], [entry(b"long")]),
+            Append(record("keyframe", "missing"), [], [entry(b"nowhere")]),
+            Append(record("keyframe", "not a name")),
+            Append(record("keyframe", "inline"), [b"abc"], [entry(b"abc")]),
+            Append(record("event", "last")),
+        ]
     )
-    names = {path.name for path in (tmp_path / "session" / "blobs").glob("*[0-9a-f]")}
-    assert 0 < len(names) < 16
-    assert [ledger.store.blob(entry(content).sha256) for content in contents] == contents
+    assert gate.commit_sizes == [1]
+    kinds = [type(outcome) for outcome in outcomes]
+    assert kinds == [Appended, ConflictError, Appended, UnknownError, InvalidRequestError, Appended, Appended]
+    assert [(o.sequence, o.was_known) for o in outcomes if isinstance(o, Appended)] == [
+        (1, False), (2, False), (1, True), (0, False)
+    ]  # fmt: skip
+    assert [row.record_id for row in ledger.store.read("keyframe")] == ["first", "inline", "file"]
+    assert [ledger.store.blob(entry(content).sha256) for content in (b"abc", b"long")] == [b"abc", b"long"]
     ledger.close()
-    report = check(tmp_path / "session")
-    assert report.is_sound and report.blob_count == 16 and report.repaired == ()
+    assert check(tmp_path / "session").is_sound
+
+
+def test_when_the_commit_fails_nobody_in_it_is_acknowledged(ledger: Ledger) -> None:
+    (pages,) = ledger.rows._writer.execute("PRAGMA page_count").fetchone()
+    ledger.rows._writer.execute(f"PRAGMA max_page_count = {pages + 1}")
+    large = [dataclasses.replace(record("event", f"{index}"), payload=bytes(20_000)) for index in range(3)]
+    outcomes = ledger.store.append_all([Append(entry) for entry in large])
+    assert [type(outcome) for outcome in outcomes] == [DiskFullError] * 3
+    assert ledger.store.positions() == {}
+    ledger.rows._writer.execute("PRAGMA max_page_count = 1000000")
+    assert [o.sequence for o in map(ledger.store.append, large)] == [0, 1, 2]
 
 
 def test_a_refused_record_leaves_no_content_behind(tmp_path: Path) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-import queue
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import zenoh
@@ -25,31 +26,60 @@ from vggt_motion.errors import (
 
 _log = logging.getLogger(__name__)
 Handler = Callable[[str, bytes], bytes]
+BatchHandler = Callable[[Sequence[bytes]], Sequence[bytes | Exception]]
 REFUSAL_ENCODING = codec.encoding_of(calls.Refusal)
 _FIFO_CAPACITY = 8
 _MAX_PENDING = 1024
 _MAX_PENDING_BYTES = 512 * 2**20
+_MAX_BATCH_BYTES = 8 * 2**20
 _MAX_MESSAGE_CHARS = 1000
 _CLOSE_S = 1.0
 
 
-class Server:
-    """One queryable with its threads; they are started as they are needed, up to the given number."""
+@dataclass(frozen=True)
+class _Request:
+    """A query that was taken in."""
 
-    def __init__(self, session: zenoh.Session, key: str, handler: Handler, *, threads: int) -> None:
-        self._handler = handler
+    query: zenoh.Query
+    size_bytes: int
+
+
+class Server:
+    """One queryable with its threads; they are started as they are needed, up to one more than may answer at a time.
+
+    Every thread receives and answers, so that a query costs no change of thread. One that comes while enough others
+    answer lets its query wait, or refuses it when there are too many, and receives on: somebody always does, for a
+    channel that fills holds up everything on its link.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, key: str, handler: Handler | BatchHandler, *, threads: int, at_a_time: int | None
+    ) -> None:
+        """Declare the queryable.
+
+        Args:
+            session: where it is declared.
+            key: may hold wildcards, if not ``at_a_time``.
+            handler: of one request, or of a batch.
+            threads: so many may answer at the same time.
+            at_a_time: how many requests a batch may hold; None: ``handler`` takes one.
+        """
+        self._handler: Any = handler
         self._key = key
-        self._max_threads = threads
-        self._pending: queue.SimpleQueue[zenoh.Query | None] = queue.SimpleQueue()
+        self._max_answering = threads
+        self._at_a_time = at_a_time
         self._lock = threading.Lock()
-        self._pending_count = self._pending_bytes = self._idle = 0
-        self._workers: list[threading.Thread] = []
+        self._waiting: deque[_Request] = deque()
+        self._held_bytes = 0  # of requests that are not answered yet
+        self._answering = 0
+        self._receiving = 0
         self.is_closed = False
         channel: Any = handlers.FifoChannel(_FIFO_CAPACITY)
         self._queryable: Any = session.declare_queryable(key, channel, complete=True)
         self._channel = self._queryable.handler
-        self._thread = threading.Thread(target=self._take_in, name=f"take in {key}", daemon=True)
-        self._thread.start()
+        self._threads: list[threading.Thread] = []
+        with self._lock:
+            self._start()
 
     def begin_close(self) -> None:
         """Take no more queries and refuse those that wait."""
@@ -60,74 +90,93 @@ class Server:
             self._queryable.undeclare()
         except (zenoh.ZError, RuntimeError):
             _log.debug("already undeclared", extra={"key": self._key})
-        for _ in range(len(self._workers)):
-            self._pending.put(None)
 
     def close(self, wait_s: float = _CLOSE_S) -> None:
         """End, and give the handlers that are under way a moment to answer."""
         self.begin_close()
         deadline = time.monotonic() + wait_s
-        for thread in (self._thread, *self._workers):
+        with self._lock:
+            threads = list(self._threads)
+        for thread in threads:
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))
 
-    def _take_in(self) -> None:
+    def _start(self) -> None:
+        """One thread more; with the lock."""
+        self._receiving += 1
+        thread = threading.Thread(target=self._work, name=f"serve {self._key}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _work(self) -> None:
         while True:
             try:
                 query = self._channel.recv()
             except zenoh.ZError:
                 return
-            size = len(query.payload) if query.payload is not None else 0
-            with self._lock:
-                is_full = self._pending_count >= _MAX_PENDING or self._pending_bytes + size > _MAX_PENDING_BYTES
-                if not (is_full or self.is_closed):
-                    self._pending_count += 1
-                    self._pending_bytes += size
-            if is_full or self.is_closed:
-                _refuse(query, RefusalCode.UNAVAILABLE, "stopping" if self.is_closed else "overloaded, try again later")
-                continue
-            self._pending.put(query)
-            with self._lock:
-                if self._idle < self._pending_count and len(self._workers) < self._max_threads:
-                    worker = threading.Thread(target=self._work, name=f"serve {self._key}", daemon=True)
-                    self._workers.append(worker)
-                    worker.start()
+            batch = self._take(query)
+            del query
+            while batch:
+                try:
+                    self._answer(batch)
+                finally:
+                    with self._lock:
+                        self._held_bytes -= sum(request.size_bytes for request in batch)
+                        batch = self._next_batch()
 
-    def _work(self) -> None:
-        while True:
-            with self._lock:
-                self._idle += 1
-            query = self._pending.get()
-            with self._lock:
-                self._idle -= 1
-            if query is None:
-                return
-            size = len(query.payload) if query.payload is not None else 0
-            with self._lock:
-                self._pending_count -= 1
-            try:
-                self._answer(query)
-            finally:
-                with self._lock:
-                    self._pending_bytes -= size
+    def _take(self, query: zenoh.Query) -> list[_Request]:
+        """Take a query in; returns what this thread is to answer now."""
+        size_bytes = len(query.payload) if query.payload is not None else 0
+        with self._lock:
+            is_full = len(self._waiting) >= _MAX_PENDING or self._held_bytes + size_bytes > _MAX_PENDING_BYTES
+            if not (is_full or self.is_closed):
+                self._held_bytes += size_bytes
+                self._waiting.append(_Request(query, size_bytes))
+                if self._answering >= self._max_answering:
+                    return []
+                self._answering += 1
+                self._receiving -= 1
+                if self._receiving == 0 and len(self._threads) <= self._max_answering:
+                    self._start()
+                return self._next_batch()
+        _refuse(query, RefusalCode.UNAVAILABLE, "stopping" if self.is_closed else "overloaded, try again later")
+        return []
 
-    def _answer(self, query: zenoh.Query) -> None:
-        if self.is_closed:
-            _refuse(query, RefusalCode.UNAVAILABLE, "stopping")
-            return
-        key = str(query.key_expr)
-        payload = query.payload.to_bytes() if query.payload is not None else b""
+    def _next_batch(self) -> list[_Request]:
+        """What waits, as much as fits into a batch; nothing: this thread is to receive again. With the lock."""
+        batch: list[_Request] = []
+        size_bytes = 0
+        while self._waiting and len(batch) < (self._at_a_time or 1):
+            size_bytes += self._waiting[0].size_bytes
+            if batch and size_bytes > _MAX_BATCH_BYTES:
+                break
+            batch.append(self._waiting.popleft())
+        if not batch:
+            self._answering -= 1
+            self._receiving += 1
+        return batch
+
+    def _answer(self, batch: Sequence[_Request]) -> None:
+        requests: list[tuple[zenoh.Query, str, bytes]] = []
+        for request in batch:
+            query = request.query
+            key = str(query.key_expr)
+            if self.is_closed:
+                _refuse(query, RefusalCode.UNAVAILABLE, "stopping")
+            elif "*" in key:
+                _refuse(query, RefusalCode.INVALID, "a request names one key, without wildcards")
+            else:
+                requests.append((query, key, query.payload.to_bytes() if query.payload is not None else b""))
+        outcomes: Sequence[bytes | Exception]
         try:
-            if "*" in key:
-                raise RequestRefusedError("a request names one key, without wildcards")
-            reply = self._handler(key, payload)
-        except VggtMotionError as error:
-            _refuse(query, refusal_code(error), str(error))
+            if self._at_a_time is None:
+                outcomes = [self._handler(key, payload) for _, key, payload in requests]
+            else:
+                outcomes = self._handler([payload for _, _, payload in requests])
         except Exception as error:
-            _log.exception("a request ended in a defect of ours", extra={"key": key, "bytes": len(payload)})
-            _refuse(query, RefusalCode.INTERNAL, f"internal error: {type(error).__name__}")
-        else:
-            _send(query, lambda: query.reply(key, reply))
+            outcomes = [error] * len(requests)
+        for (query, key, payload), outcome in zip(requests, outcomes, strict=True):
+            _reply(query, key, outcome, len(payload))
 
 
 def refusal_code(error: VggtMotionError) -> RefusalCode:
@@ -150,6 +199,17 @@ def error_of(refusal: calls.Refusal) -> VggtMotionError:
     if refusal.code is RefusalCode.UNAVAILABLE:
         return BusUnavailableError(refusal.message)
     return RequestRefusedError(refusal.message, refusal.code)
+
+
+def _reply(query: zenoh.Query, key: str, outcome: bytes | Exception, request_bytes: int) -> None:
+    if isinstance(outcome, VggtMotionError):
+        _refuse(query, refusal_code(outcome), str(outcome))
+    elif isinstance(outcome, Exception):
+        extra = {"key": key, "bytes": request_bytes}
+        _log.error("a request ended in a defect of ours", extra=extra, exc_info=outcome)
+        _refuse(query, RefusalCode.INTERNAL, f"internal error: {type(outcome).__name__}")
+    else:
+        _send(query, lambda: query.reply(key, outcome))
 
 
 def _refuse(query: zenoh.Query, code: RefusalCode, message: str) -> None:

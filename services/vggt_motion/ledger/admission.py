@@ -10,6 +10,7 @@ from typing import Any
 
 from vggt_motion.bus import calls, codec
 from vggt_motion.errors import CodecError, RefusalCode, RequestRefusedError
+from vggt_motion.ledger.log import Append
 from vggt_motion.ledger.store import Blob, BlobEntry, InvalidRequestError, NewRecord
 from vggt_motion.records import (
     Constraint,
@@ -22,7 +23,7 @@ from vggt_motion.records import (
 )
 
 
-def admitted(request: calls.AppendRequest) -> tuple[NewRecord, list[Blob], list[BlobEntry]]:
+def admitted(request: calls.AppendRequest) -> Append:
     """The record of a request, its new blobs, and the blobs that it refers to.
 
     Raises:
@@ -49,7 +50,7 @@ def admitted(request: calls.AppendRequest) -> tuple[NewRecord, list[Blob], list[
         payload=request.payload,
         identity_sha256=request.identity_sha256,
     )
-    return admitted_record, blobs, [BlobEntry(ref.sha256, ref.size_bytes) for ref in request.blob_refs]
+    return Append(admitted_record, blobs, [BlobEntry(ref.sha256, ref.size_bytes) for ref in request.blob_refs])
 
 
 def known_stream(name: str) -> Stream:

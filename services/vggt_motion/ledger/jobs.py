@@ -246,9 +246,8 @@ class JobQueue:
                 return Done(DoneOutcome.ALREADY_DONE, known.sequence)
             return Done(DoneOutcome.COMMITTED, self._store.add(transaction, record, prepared).sequence)
 
-        with self._store.bringing(blobs):
-            prepared = self._store.prepare(blobs, references, is_input=False)
-            return self._rows.write(change)
+        prepared = self._store.prepare(blobs, references, is_input=False)
+        return self._rows.write(change)
 
     def fail(self, job_id: str, lease_id: str, reason: str, traceback: str = "", *, is_permanent: bool = False) -> bool:
         """Give a job back after an error; until ``max_failures`` it is tried again, after a back-off that doubles.

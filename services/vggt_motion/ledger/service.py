@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -29,6 +29,7 @@ from vggt_motion.errors import (
 from vggt_motion.ledger.admission import admitted, known_stream
 from vggt_motion.ledger.directory import Ledger
 from vggt_motion.ledger.jobs import JobPolicy
+from vggt_motion.ledger.log import Append
 from vggt_motion.ledger.store import NewRecord, RecordRow, reserve_line
 from vggt_motion.records import (
     Event,
@@ -65,7 +66,8 @@ _MAX_VANISHED = 4096
 _JOIN_S = 1.0
 
 # Long polls have threads of their own, so that they never hold up an append.
-_APPEND_THREADS = 16  # what waits together for the disk shares one fsync
+_APPEND_THREADS = 2  # one prepares while the other waits for the disk
+_APPENDS_AT_A_TIME = 64  # what comes meanwhile shares one fsync
 _DONE_THREADS = 8
 _READ_THREADS = 4
 _CLAIM_THREADS = 64
@@ -307,7 +309,6 @@ class Desk:
     def serve(self, bus: Bus, presence: Presence) -> Iterator[Closable]:
         """Declare every key."""
         handlers: list[tuple[str, int, Callable[[str, bytes], bytes]]] = [
-            (bus.keys.rpc("ledger", "append"), _APPEND_THREADS, lambda _, payload: self.append(payload)),
             (bus.keys.rpc("ledger", "read"), _READ_THREADS, lambda _, payload: self.read(payload)),
             (bus.keys.rpc("ledger", "status"), _FEW_THREADS, lambda _, payload: self.answer_status(payload)),
             (bus.keys.all_blobs(), _READ_THREADS, lambda key, _: self.blob(last_chunk(key))),
@@ -319,6 +320,9 @@ class Desk:
             (bus.keys.rpc("jobs", "reports"), _FEW_THREADS, lambda _, payload: self.reports(payload)),
             (bus.keys.rpc("jobs", "cancel"), _FEW_THREADS, lambda _, payload: self.cancel(payload)),
         ]
+        yield bus.serve_together(
+            bus.keys.rpc("ledger", "append"), self.append, at_a_time=_APPENDS_AT_A_TIME, threads=_APPEND_THREADS
+        )
         for key, threads, handler in handlers:
             yield bus.serve(key, self.guarded(handler), threads=threads)
 
@@ -326,12 +330,18 @@ class Desk:
         """From now on, a call that fails because the session is closed may be repeated elsewhere."""
         self._is_closed = True
 
-    def append(self, payload: bytes) -> bytes:
-        """``@rpc/ledger/append``."""
-        request = codec.decode(calls.AppendRequest, payload)
-        appended = self._ledger.store.append(*admitted(request))
+    def append(self, payloads: Sequence[bytes]) -> list[bytes | Exception]:
+        """``@rpc/ledger/append``, several at a time: each for itself, under one fsync."""
+        wanted = [_admitted_or_why_not(payload) for payload in payloads]
+        appended = iter(self._ledger.store.append_all([entry for entry in wanted if isinstance(entry, Append)]))
+        outcomes = [next(appended) if isinstance(entry, Append) else entry for entry in wanted]
         self._wake_publisher()
-        return codec.encode(calls.AppendReply(appended.sequence, appended.was_known))
+        return [
+            self._answerable("append", outcome)
+            if isinstance(outcome, Exception)
+            else codec.encode(calls.AppendReply(outcome.sequence, outcome.was_known))
+            for outcome in outcomes
+        ]
 
     def read(self, payload: bytes) -> bytes:
         """``@rpc/ledger/read``."""
@@ -443,27 +453,36 @@ class Desk:
         def guarded(key: str, payload: bytes) -> bytes:
             try:
                 return handler(key, payload)
-            except (CodecError, RequestRefusedError, DiskFullError) as error:
-                self._count_refusal(key, error)
-                raise
-            except LedgerError as error:
-                # The caller may repeat it: the ledger is stopping, or will be started again.
-                if not self._is_closed and self.failure is None:
-                    _log.error("the store failed", extra={"key": key, "reason": str(error)})
-                    self.failure = error
-                raise BusUnavailableError(str(error)) from error
-            except VggtMotionError:
-                raise
             except Exception as error:
-                self._count_refusal(key, error)
-                raise
+                raise self._answerable(key, error) from error
 
         return guarded
+
+    def _answerable(self, key: str, error: Exception) -> Exception:
+        """Count and note what went wrong; returns what the caller is told."""
+        if isinstance(error, (CodecError, RequestRefusedError, DiskFullError)):
+            self._count_refusal(key, error)
+        elif isinstance(error, LedgerError):
+            # The caller may repeat it: the ledger is stopping, or will be started again.
+            if not self._is_closed and self.failure is None:
+                _log.error("the store failed", extra={"key": key, "reason": str(error)})
+                self.failure = error
+            return BusUnavailableError(str(error))
+        elif not isinstance(error, VggtMotionError):
+            self._count_refusal(key, error)
+        return error
 
     def _count_refusal(self, key: str, error: Exception) -> None:
         with self._lock:
             self._refused_count += 1
         _log.warning("a request was refused", extra={"key": key, "reason": one_line(str(error))})
+
+
+def _admitted_or_why_not(payload: bytes) -> Append | Exception:
+    try:
+        return admitted(codec.decode(calls.AppendRequest, payload))
+    except Exception as error:
+        return error
 
 
 def _entry(row: RecordRow) -> LogEntry:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import operator
 import queue
 import sqlite3
 import threading
@@ -24,7 +25,10 @@ T = TypeVar("T")
 
 _MAX_READERS = 8
 _WAL_LIMIT_BYTES = 64 * 2**20
-_RECORD_COLUMNS = ", ".join(field.name for field in dataclasses.fields(RecordRow))
+_RECORD_NAMES = tuple(field.name for field in dataclasses.fields(RecordRow))
+_RECORD_COLUMNS = ", ".join(_RECORD_NAMES)
+_ADD_RECORD = f"INSERT INTO records ({_RECORD_COLUMNS}) VALUES ({', '.join('?' * len(_RECORD_NAMES))})"
+_record_values = operator.attrgetter(*_RECORD_NAMES)
 _JOB_COLUMNS = ", ".join(field.name for field in dataclasses.fields(JobRow))
 _JOB_CONTENT = ("job_id", "submission", "kind", "model", "priority", "payload_type", "payload")
 _JOB_PROGRESS = tuple(field.name for field in dataclasses.fields(JobRow) if field.name not in _JOB_CONTENT)
@@ -142,8 +146,7 @@ class _Statements:
         return int(self._value("SELECT next_sequence FROM streams WHERE stream = ?", stream)) - 1
 
     def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
-        values = dataclasses.astuple(row)
-        self._run(f"INSERT INTO records ({_RECORD_COLUMNS}) VALUES ({_marks(values)})", *values)
+        self._run(_ADD_RECORD, *_record_values(row))
         for blob in sorted(set(blobs), key=lambda blob: blob.sha256):
             self._run(
                 "INSERT INTO blobs (sha256, size_bytes, is_file) VALUES (?, ?, ?) ON CONFLICT (sha256) DO NOTHING",
@@ -236,16 +239,14 @@ def _offered(kinds: Collection[str], models: Collection[str]) -> tuple[str, list
 
 
 class _Pending(Generic[T]):
-    """One change on its way through the group commit."""
+    """The changes of one caller on their way through the group commit."""
 
-    def __init__(self, change: Callable[[Transaction], T]) -> None:
-        self.change = change
+    def __init__(self, changes: Sequence[Callable[[Transaction], T]]) -> None:
+        self.changes = changes
+        self.outcomes: list[T | Exception] = []
+        self.error: BaseException | None = None  # of the commit as a whole
         self.is_finished = False
-        self.result: T
-        self.error: BaseException | None = None
-
-    def run(self, transaction: Transaction) -> None:
-        self.result = self.change(transaction)
+        self.gate: threading.Lock | None = None  # where the caller waits, until it is finished or its turn to commit
 
 
 class SqliteRows:
@@ -258,7 +259,8 @@ class SqliteRows:
             LedgerError: not a database of ours, of a newer schema, damaged, or not writable.
         """
         self._path = path
-        self._condition = threading.Condition()
+        self._lock = threading.Lock()
+        self._is_idle = threading.Condition(self._lock)
         self._pending: list[_Pending[Any]] = []
         self._is_committing = False
         self._failure: str | None = None
@@ -278,27 +280,45 @@ class SqliteRows:
 
     def write(self, change: Callable[[Transaction], T]) -> T:
         """Carry out one change atomically; see :meth:`.store.Rows.write`."""
-        item: _Pending[T] = _Pending(change)
-        with self._condition:
+        (outcome,) = self.write_all([change])
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def write_all(self, changes: Sequence[Callable[[Transaction], T]]) -> list[T | Exception]:
+        """Carry out several changes, each atomically, under one fsync; see :meth:`.store.Rows.write_all`."""
+        item: _Pending[T] = _Pending(changes)
+        with self._lock:
             self._pending.append(item)
-            while self._is_committing and not item.is_finished:
-                self._condition.wait()
-            batch: list[_Pending[Any]] = []
-            if not item.is_finished:
-                batch, self._pending = self._pending, []
-                self._is_committing = True
-        if batch:
-            try:
-                self._commit(batch)
-            finally:
-                with self._condition:
-                    for member in batch:
-                        member.is_finished = True
-                    self._is_committing = False
-                    self._condition.notify_all()
+            if self._is_committing:
+                item.gate = threading.Lock()
+                item.gate.acquire()
+            self._is_committing = True
+        if item.gate is not None:
+            item.gate.acquire()
+        if not item.is_finished:
+            self._commit_pending()
         if item.error is not None:
             raise item.error
-        return item.result
+        return item.outcomes
+
+    def _commit_pending(self) -> None:
+        """Commit what has gathered, and pass the turn to the first that came meanwhile."""
+        with self._lock:
+            batch, self._pending = self._pending, []
+        try:
+            self._commit(batch)
+        finally:
+            with self._lock:
+                self._is_committing = bool(self._pending)
+                following = self._pending[:1]
+                if not following:
+                    self._is_idle.notify_all()
+            for member in batch:
+                member.is_finished = True
+            for member in (*following, *batch):
+                if member.gate is not None:
+                    member.gate.release()
 
     def read(self, query: Callable[[Reader], T]) -> T:
         """Ask for committed rows; see :meth:`.store.Rows.read`."""
@@ -325,9 +345,8 @@ class SqliteRows:
 
     def close(self) -> None:
         """Finish the present commit, fold the write-ahead log into the database and close it."""
-        with self._condition:
-            while self._is_committing:
-                self._condition.wait()
+        with self._is_idle:
+            self._is_idle.wait_for(lambda: not self._is_committing)
             if self._failure is None:
                 self._failure = f"{self._path} is closed"
         for _ in range(_MAX_READERS):
@@ -344,9 +363,12 @@ class SqliteRows:
                 raise LedgerError(self._failure)
             with _errors_of(self._path):
                 self._writer.execute("BEGIN IMMEDIATE")
-                for item in batch:
-                    self._run_one(item)
-                self._writer.execute("COMMIT")
+                if sum(len(item.changes) for item in batch) == 1:
+                    self._run_alone(batch[0])
+                else:
+                    for item in batch:
+                        self._run_among_others(item)
+                    self._writer.execute("COMMIT")
         except BaseException as error:
             if self._failure is None and _is_storage_failure(error.__cause__):
                 # After a failed write the state of the file is not known until it is opened and recovered again.
@@ -355,22 +377,33 @@ class SqliteRows:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
             for item in batch:
-                item.error = item.error or error
+                item.error = error
 
-    def _run_one(self, item: _Pending[Any]) -> None:
-        self._writer.execute("SAVEPOINT change")
+    def _run_alone(self, item: _Pending[Any]) -> None:
+        """One change is the whole transaction."""
+        (outcome,) = item.outcomes = [self._outcome(item.changes[0])]
+        self._writer.execute("ROLLBACK" if isinstance(outcome, Exception) else "COMMIT")
+
+    def _run_among_others(self, item: _Pending[Any]) -> None:
+        """Each change may be undone without the others."""
+        for change in item.changes:
+            self._writer.execute("SAVEPOINT change")
+            outcome = self._outcome(change)
+            if isinstance(outcome, Exception):
+                self._writer.execute("ROLLBACK TO change")
+            self._writer.execute("RELEASE change")
+            item.outcomes.append(outcome)
+
+    def _outcome(self, change: Callable[[Transaction], T]) -> T | Exception:
         try:
-            item.run(self._statements)
+            return change(self._statements)
         except (sqlite3.IntegrityError, sqlite3.InterfaceError, sqlite3.DataError, sqlite3.ProgrammingError) as error:
-            item.error = LedgerError(f"{self._path}: {error}")
-            self._writer.execute("ROLLBACK TO change")
+            return LedgerError(f"{self._path}: {error}")
         except sqlite3.Error:
             # Full or failing storage may have ended the whole transaction: nobody in it is acknowledged.
             raise
-        except BaseException as error:
-            item.error = error
-            self._writer.execute("ROLLBACK TO change")
-        self._writer.execute("RELEASE change")
+        except Exception as error:
+            return error
 
 
 def connect(path: Path, *, is_read_only: bool = False) -> sqlite3.Connection:

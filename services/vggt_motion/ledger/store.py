@@ -238,6 +238,17 @@ class Rows(Protocol):
             LedgerError: the store failed; it has to be opened anew.
         """
 
+    def write_all(self, changes: Sequence[Callable[[Transaction], T]]) -> list[T | Exception]:
+        """As :meth:`write`, of several changes that may share a commit; each is undone alone.
+
+        Returns:
+            For each change, in order, what it returned or what it raised.
+
+        Raises:
+            DiskFullError: there is no space; nothing was changed.
+            LedgerError: the store failed; it has to be opened anew.
+        """
+
     def read(self, query: Callable[[Reader], T]) -> T:
         """Ask for committed rows."""
 
