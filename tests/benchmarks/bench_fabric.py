@@ -4,6 +4,8 @@
 
 Three processes on loopback: router, ledger, client. The bare limits are: write and fsync of the same bytes to a new
 file; the same bytes over Zenoh through the router to a process that answers with one byte (one hop); their SHA-256.
+Each is measured in a loop of its own, with everything it touches in the caches. The chain is all three in a row, as in
+an append: one hop to a process that writes, forces to the disk and hashes before it answers; nothing else.
 The folder must be on a real disk: in memory an fsync costs nothing. A round measures everything for a moment, and the
 rounds are repeated, so that a disk that has a bad minute has it for all.
 
@@ -32,6 +34,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import median
+from typing import TypeVar
 
 import cv2
 import psutil
@@ -45,7 +48,7 @@ from ledger_processes import Site, depth_blob, event, keyframe, predict, site, s
 from vggt_motion.bus import codec
 from vggt_motion.bus.follow import Follower
 from vggt_motion.bus.ledger import append_request
-from vggt_motion.bus.service import run_service
+from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.bus.session import zenoh_config
 from vggt_motion.config import Config, LedgerConfig
 from vggt_motion.errors import LedgerError
@@ -66,6 +69,10 @@ MIN_COUNT = 3
 BYTES_PER_ROUND = 400_000_000  # a round of large records ends early rather than fill the disk
 
 
+Entry = tuple[str, str, Event | Keyframe, list[bytes]]
+Item = TypeVar("Item")
+
+
 class Source:
     """New content for every call: nothing may be recognised as known."""
 
@@ -81,7 +88,11 @@ class Source:
             self._count += 1
             return self._count, self._count.to_bytes(8, "little") + self._body
 
-    def record(self) -> tuple[str, str, Event | Keyframe, list[bytes]]:
+    def data(self) -> bytes:
+        """New bytes."""
+        return self.next()[1]
+
+    def record(self) -> Entry:
         """Small records have no blob; the others are keyframes with an image of the size."""
         number, data = self.next()
         if self.size_bytes <= 100:
@@ -91,18 +102,19 @@ class Source:
         return "keyframe", frame.keyframe_id, frame, [data]
 
 
-def one_by_one(call: Callable[[], None], seconds: float, max_count: int) -> list[float]:
-    """Seconds of every call."""
+def one_by_one(make: Callable[[], Item], call: Callable[[Item], object], seconds: float, max_count: int) -> list[float]:
+    """Seconds of every call; what it is called with is made before."""
     durations: list[float] = []
     end = time.perf_counter() + seconds
     while (time.perf_counter() < end or len(durations) < MIN_COUNT) and len(durations) < max_count:
+        item = make()
         begin = time.perf_counter()
-        call()
+        call(item)
         durations.append(time.perf_counter() - begin)
     return durations
 
 
-def many_at_once(call: Callable[[], None], seconds: float, max_count: int) -> float:
+def many_at_once(make: Callable[[], Item], call: Callable[[Item], object], seconds: float, max_count: int) -> float:
     """Calls per second with IN_FLIGHT of them under way."""
     end = time.perf_counter() + seconds
     counts = [0] * IN_FLIGHT
@@ -110,7 +122,7 @@ def many_at_once(call: Callable[[], None], seconds: float, max_count: int) -> fl
 
     def run(index: int) -> None:
         while counts[index] < share and (time.perf_counter() < end or counts[index] == 0):
-            call()
+            call(make())
             counts[index] += 1
 
     begin = time.perf_counter()
@@ -119,19 +131,52 @@ def many_at_once(call: Callable[[], None], seconds: float, max_count: int) -> fl
     return sum(counts) / (time.perf_counter() - begin)
 
 
+def write_and_sync(folder: Path, data: bytes) -> None:
+    """A new file with this content, which begins with a number of its own, forced to the disk."""
+    descriptor = os.open(folder / f"{len(data)}-{data[:8].hex()}", os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+    os.write(descriptor, data)
+    os.fsync(descriptor)
+    os.close(descriptor)
+
+
+def answer_chain(context: ServiceContext, folder: Path) -> None:
+    """Beside the bare answers: one that writes, forces to the disk and hashes before it answers, in 16 threads."""
+    session = zenoh.open(zenoh_config(context.config.bus))
+    key = context.bus.keys.rpc("bench", "chain")
+    queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(1024), complete=True)
+
+    def loop() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            while True:
+                with queryable.handler.recv() as query:
+                    assert query.payload is not None
+                    data = query.payload.to_bytes()
+                    write_and_sync(folder, data)
+                    hashlib.sha256(data).digest()
+                    query.reply(key, b"k")
+
+    for _ in range(16):
+        threading.Thread(target=loop, daemon=True).start()
+    answer(context)
+    session.close()  # type: ignore[no-untyped-call]
+
+
 class Bench:
     """The calls that are compared, on one set of processes."""
 
     def __init__(self, place: Site, folder: Path, stack: ExitStack) -> None:
-        stack.enter_context(running(folder, "--serve", place.endpoint, script=Path(__file__)))
-        self.place = place
+        chain_folder = folder / "chain"
         self.folder = folder / "bare"
-        self.folder.mkdir()
+        for made in (chain_folder, self.folder):
+            made.mkdir()
+        stack.enter_context(running(folder, "--serve", place.endpoint, str(chain_folder), script=Path(__file__)))
+        self.place = place
         self.client = place.client()
         self.jobs = place.jobs()
         self.session = zenoh.open(zenoh_config(place.bus.config))
         stack.callback(self.session.close)
         self.hop_key = place.bus.keys.rpc("bench", "bare")
+        self.chain_key = place.bus.keys.rpc("bench", "chain")
         self.store = open_session(folder / "local", LedgerConfig(reserve_bytes=0))
         stack.callback(self.store.close)
         wait_until(self._is_ready)
@@ -152,22 +197,22 @@ class Bench:
         """The same over our bus."""
         self.place.bus.request(self.place.bus.keys.rpc("bench", "ours"), data)
 
-    def fsync(self, number: int, data: bytes) -> None:
+    def fsync(self, data: bytes) -> None:
         """A new file, durable."""
-        descriptor = os.open(self.folder / f"{len(data)}-{number}", os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-        os.write(descriptor, data)
-        os.fsync(descriptor)
-        os.close(descriptor)
+        write_and_sync(self.folder, data)
 
-    def append(self, source: Source) -> None:
+    def chain(self, data: bytes) -> None:
+        """All bare limits in a row."""
+        reply = self.session.get(self.chain_key, payload=data, timeout=30.0).recv().ok
+        assert reply is not None and reply.payload.to_bytes() == b"k"
+
+    def append(self, entry: Entry) -> None:
         """Over the bus, as every service does."""
-        stream, record_id, record, blobs = source.record()
-        assert not self.client.append(stream, record_id, record, blobs).was_known
+        assert not self.client.append(*entry).was_known
 
-    def append_locally(self, source: Source) -> None:
+    def append_locally(self, entry: Entry) -> None:
         """The same without the bus: what store and admission cost."""
-        request = append_request(*source.record())
-        self.store.store.append(*admitted(request))
+        self.store.store.append(*admitted(append_request(*entry)))
 
     def claim_and_done(self, depths: Mapping[int, bytes], shape: tuple[int, int]) -> None:
         """One job: leased, and its result with one blob committed."""
@@ -180,39 +225,40 @@ class Bench:
 
 def measure(bench: Bench, size_bytes: int, seconds: float) -> dict[str, float]:
     """One size: medians in milliseconds, rates per second."""
-    sequential: dict[str, list[float]] = {name: [] for name in ("fsync", "hop", "request", "hash", "append", "local")}
-    sources = {name: Source(size_bytes) for name in sequential}
-    rates: dict[str, list[float]] = {"append64": [], "local64": []}
-    max_count = max(IN_FLIGHT, BYTES_PER_ROUND // ROUNDS // max(size_bytes, 1))
-    calls: dict[str, Callable[[], None]] = {
-        "fsync": lambda: bench.fsync(*sources["fsync"].next()),
-        "hop": lambda: bench.hop(sources["hop"].next()[1]),
-        "request": lambda: bench.request(sources["request"].next()[1]),
-        "hash": lambda: hashlib.sha256(sources["hash"].next()[1]).digest() and None,
-        "append": lambda: bench.append(sources["append"]),
-        "local": lambda: bench.append_locally(sources["local"]),
+    bare: dict[str, Callable[[bytes], object]] = {
+        "fsync": bench.fsync,
+        "hop": bench.hop,
+        "hash": lambda data: hashlib.sha256(data).digest(),
+        "chain": bench.chain,
+        "request": bench.request,
     }
+    ours: dict[str, Callable[[Entry], object]] = {"append": bench.append, "local": bench.append_locally}
+    sources = {name: Source(size_bytes) for name in (*bare, *ours)}
+    durations: dict[str, list[float]] = {name: [] for name in sources}
+    rates: dict[str, list[float]] = {name: [] for name in ("hop", "chain", "append", "local")}
+    max_count = max(IN_FLIGHT, BYTES_PER_ROUND // ROUNDS // max(size_bytes, 1))
     for _ in range(ROUNDS):
-        for name, durations in sequential.items():
-            durations += one_by_one(calls[name], seconds, max_count)
-        rates["append64"].append(many_at_once(calls["append"], seconds, max_count))
-        rates["local64"].append(many_at_once(calls["local"], seconds, max_count))
-    ms = {name: 1e3 * median(durations) for name, durations in sequential.items()}
-    limit_ms = ms["fsync"] + ms["hop"] + ms["hash"]
-    fsync_rate = len(sequential["fsync"]) / sum(sequential["fsync"])
+        for name, spent in durations.items():
+            if name in bare:
+                spent += one_by_one(sources[name].data, bare[name], seconds, max_count)
+            else:
+                spent += one_by_one(sources[name].record, ours[name], seconds, max_count)
+        for name, counted in rates.items():
+            if name in bare:
+                counted.append(many_at_once(sources[name].data, bare[name], seconds, max_count))
+            else:
+                counted.append(many_at_once(sources[name].record, ours[name], seconds, max_count))
+    ms = {name: 1e3 * median(spent) for name, spent in durations.items()}
+    fsync_rate = len(durations["fsync"]) / sum(durations["fsync"])
     return {
         "bytes": size_bytes,
-        "fsync_ms": ms["fsync"],
-        "hop_ms": ms["hop"],
-        "request_ms": ms["request"],
-        "hash_ms": ms["hash"],
-        "append_ms": ms["append"],
-        "append_over_limit": ms["append"] / limit_ms,
-        "local_append_ms": ms["local"],
+        **{f"{name}_ms": value for name, value in ms.items()},
+        "append_over_sum": ms["append"] / (ms["fsync"] + ms["hop"] + ms["hash"]),
+        "append_over_chain": ms["append"] / ms["chain"],
         "fsync_per_s": fsync_rate,
-        "append64_per_s": median(rates["append64"]),
-        "append64_over_fsync": median(rates["append64"]) / fsync_rate,
-        "local64_per_s": median(rates["local64"]),
+        **{f"{name}_64_per_s": median(counted) for name, counted in rates.items()},
+        "append_64_over_fsync": median(rates["append"]) / fsync_rate,
+        "chain_64_over_fsync": median(rates["chain"]) / fsync_rate,
     }
 
 
@@ -363,10 +409,12 @@ def main() -> int:
     parser.add_argument("--source", default=str(SAMPLE), help="of the run whose CPU seconds are counted")
     parser.add_argument("--json", type=Path, help="write the rows here as well")
     # Internal: be the answerer.
-    parser.add_argument("--serve", metavar="ENDPOINT", help=argparse.SUPPRESS)
+    parser.add_argument("--serve", nargs=2, metavar=("ENDPOINT", "FOLDER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.serve:
-        return run_service("bench", Config(bus=bus_config(arguments.serve, connect_timeout_s=20.0)), answer)
+        endpoint, chain_folder = arguments.serve
+        config = Config(bus=bus_config(endpoint, connect_timeout_s=20.0))
+        return run_service("bench", config, lambda context: answer_chain(context, Path(chain_folder)))
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=arguments.directory)))
         place = stack.enter_context(site(folder, "ledger.reserve_bytes=0"))
