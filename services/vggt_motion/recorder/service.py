@@ -51,7 +51,7 @@ _REPORT_S = 0.5
 _RECORDS_A_TURN = 100
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
 _BLOB_PATIENCE_S = 2.0
-_VIEW_REST = 4.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
+_VIEW_REST = 9.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
 _VIEW_POINTS = 200_000
 
 
