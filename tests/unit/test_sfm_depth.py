@@ -60,12 +60,12 @@ def test_error_falls_as_confidence_rises(forward: tuple[dict[int, dense.DepthMap
     confidence = np.concatenate([maps[p].confidence.ravel() for p in maps])
     depth = np.concatenate([maps[p].depth.ravel() for p in maps])
     exact = np.concatenate([truth[p].ravel() for p in maps])
-    medians = []
+    quantiles = []
     for low, high in ((0.01, 0.2), (0.2, 0.5), (0.5, 0.8), (0.8, 1.01)):
         inside = (confidence >= low) & (confidence < high) & np.isfinite(exact)
         assert inside.sum() > 500
-        medians.append(float(np.median(np.abs(depth[inside] / exact[inside] - 1.0))))
-    assert medians == sorted(medians, reverse=True)
+        quantiles.append(np.percentile(np.abs(depth[inside] / exact[inside] - 1.0), (50.0, 84.0, 95.0)))
+    assert (np.diff(quantiles, axis=0) < 0.0).all()  # the rare large errors too
 
 
 def test_sky_has_no_confidence(forward: tuple[dict[int, dense.DepthMap], list[np.ndarray]]) -> None:

@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 MAX_NEIGHBOURS = 4
+_NEEDED_NEIGHBOURS = 3  # that agree, for full confidence: two of them can err alike
 _REACH = 6  # keyframes to either side that are considered as neighbours
 _BEST_PARALLAX_PX = 8.0  # at the lattice: enough to see depth, little enough to look alike
 _PARALLAX_LOG_WIDTH = 0.9
@@ -110,7 +111,7 @@ def _judged(
 ) -> DepthMap:
     certainty = 1.0 / (1.0 + (sigma / _HALF_RELATIVE_SIGMA) ** 2)
     likeness = np.clip((found.correlation - _LOW_CORRELATION) / (_HIGH_CORRELATION - _LOW_CORRELATION), 0.0, 1.0)
-    needed = max(min(2, neighbour_count), 1)
+    needed = max(min(_NEEDED_NEIGHBOURS, neighbour_count), 1)
     confidence = certainty * likeness * np.clip(confirmed / needed, 0.0, 1.0)
     known = usable & (found.inverse_depth > 0.0) & (confidence > 1e-3)
     depth = np.where(known, 1.0 / np.maximum(found.inverse_depth, 1e-12), 0.0)
