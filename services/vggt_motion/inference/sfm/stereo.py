@@ -27,7 +27,7 @@ _NOISE_VARIANCE = 6.0  # grey levels squared, added to the variance of a window:
 _SMALL_STEP_PENALTY = 0.08
 _LARGE_STEP_PENALTY = 0.5
 _UNSEEN_COST = 1.0  # of a hypothesis that no neighbour sees
-_FINE = ((2, 0.5), (1, 0.25))  # hypotheses on each side, and their spacing in coarse steps
+_FINE = ((1, 0.5), (1, 0.25))  # hypotheses on each side, and their spacing in coarse steps
 
 
 @dataclass(frozen=True)
