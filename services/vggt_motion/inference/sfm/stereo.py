@@ -26,6 +26,7 @@ _RADIUS_PX = 2  # of the correlation window
 _NOISE_VARIANCE = 6.0  # grey levels squared, added to the variance of a window: flat windows correlate with nothing
 _SMALL_STEP_PENALTY = 0.08
 _LARGE_STEP_PENALTY = 0.5
+_SWEPT = 3  # neighbours, the first ones, of the coarse sweep; the others only help to refine
 _UNSEEN_COST = 1.0  # of a hypothesis that no neighbour sees
 _FINE = ((1, 0.5), (1, 0.25))  # hypotheses on each side, and their spacing in coarse steps
 
@@ -55,7 +56,7 @@ def match(
 
     Args:
         reference: (H, W) float32 grey image.
-        views: one to four neighbours.
+        views: one to four neighbours, the best ones first.
         intrinsics: of the lattice (H, W), shared by all.
         nearest_inverse_depth: the sweep goes from 0 to here.
         hypotheses: number of steps of the sweep.
@@ -69,9 +70,9 @@ def match(
     step = nearest_inverse_depth / (hypotheses - 1)
     cost = sweep_cost(
         _halved(reference, half_width, half_height),
-        np.stack([_halved(view.image, half_width, half_height) for view in views]),
-        rotations,
-        translations,
+        np.stack([_halved(view.image, half_width, half_height) for view in views[:_SWEPT]]),
+        rotations[:_SWEPT],
+        translations[:_SWEPT],
         pixel_rays(half).astype(np.float32),
         _camera(half),
         np.arange(hypotheses) * step,
