@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -188,6 +189,10 @@ def watch_parent(parent_pid: int) -> None:
     """Make this process end when its parent has: politely first, then at once."""
 
     def watch() -> None:
+        with contextlib.suppress(AttributeError, OSError):  # not on this system, or the parent has ended already
+            parent = os.pidfd_open(parent_pid)
+            if os.getppid() == parent_pid:
+                select.select([parent], [], [])  # readable once it has ended
         while os.getppid() == parent_pid:
             time.sleep(_PARENT_POLL_S)
         os.kill(os.getpid(), signal.SIGTERM)

@@ -79,7 +79,9 @@ class Follower(Generic[FollowedRecord]):
         self._is_doubted = True  # the ledger is to be asked whatever was published
         self._failure: VggtMotionError | None = None
         self._is_closed = False
-        self._subscription = bus.subscribe(bus.keys.log(self._stream), self._on_sample) if on_news is None else None
+        self._subscription = (
+            bus.subscribe(bus.keys.log(self._stream), self._on_sample, is_small=True) if on_news is None else None
+        )
         self._thread = threading.Thread(target=self._run, name=f"follow {stream}", daemon=True)
         self._thread.start()
 

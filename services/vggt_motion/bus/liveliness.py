@@ -93,7 +93,7 @@ class ServiceWatch:
         self._unread: dict[tuple[str, str], tuple[bytes, float]] = {}
         self._subscriptions: list[Closable] = [
             bus.watch_liveliness(bus.keys.all_alive(), self._on_token),
-            bus.subscribe(bus.keys.all_health(), self._on_health),
+            bus.subscribe(bus.keys.all_health(), self._on_health, is_small=True),
         ]
 
     def services(self) -> dict[tuple[str, str], HealthReport | None]:

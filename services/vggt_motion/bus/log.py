@@ -37,6 +37,7 @@ class LogFollower:
         positions: Mapping[Stream, int] | None = None,
         *,
         on_status: Callable[[LedgerStatus | None], None] | None = None,
+        interval_s: float = 2.0 * POLL_S,
     ) -> None:
         """Start to follow.
 
@@ -45,9 +46,11 @@ class LogFollower:
             positions: first record to deliver of each stream; 0 where it names none.
             on_status: told what the ledger says of itself whenever it was asked; None: it did not answer. Called from
                 a thread of ours.
+            interval_s: how often the ledger is asked; a lost last message shows up after this at the latest.
         """
         self._ledger = LedgerClient(bus)
         self._on_status = on_status
+        self._interval_s = interval_s
         self._news = threading.Event()
         self._closing = threading.Event()
         first = positions or {}
@@ -56,7 +59,7 @@ class LogFollower:
             for stream, cls in RECORD_OF_STREAM.items()
         }
         self._by_name = {stream.value: follower for stream, follower in self.followers.items()}
-        self._subscription = bus.subscribe(bus.keys.all_logs(), self._on_sample)
+        self._subscription = bus.subscribe(bus.keys.all_logs(), self._on_sample, is_small=True)
         self._thread = threading.Thread(target=self._watch, name="watch the log", daemon=True)
         self._thread.start()
 
@@ -97,7 +100,7 @@ class LogFollower:
         """Ask the ledger for the ends of all streams now and then: a publication may be lost."""
         wait_s = 0.0
         while not self._closing.wait(wait_s):
-            wait_s = POLL_S
+            wait_s = self._interval_s
             status: LedgerStatus | None = None
             try:
                 status = self._ledger.status()

@@ -21,9 +21,6 @@ _FIFO_CAPACITY = 8  # the default of 256 messages would be a gigabyte of images
 # publisher stands still with it. So what a publisher keeps must fit, with room for what is published meanwhile.
 MAX_HISTORY = 64
 _HISTORY_FIFO_CAPACITY = 4 * MAX_HISTORY
-# Likewise every token that is there when a watch is declared: with room for 8, a ledger that came back among nine
-# services now and then never got past its declaration. Tokens are a few bytes; no fleet is larger than this.
-_TOKEN_FIFO_CAPACITY = 2**16
 _LATEST_CAPACITY = 1
 # Recovery asks the publishers; their heartbeats alone bring nothing back after a restart of the router (Zenoh 1.10).
 _RECOVERY_INTERVAL = timedelta(seconds=1)
@@ -122,13 +119,19 @@ class Subscription:
         *,
         latest_only: bool,
         history: bool,
+        is_small: bool,
     ) -> None:
-        capacity = _HISTORY_FIFO_CAPACITY if history else _FIFO_CAPACITY
-        channel: Any = handlers.RingChannel(_LATEST_CAPACITY) if latest_only else handlers.FifoChannel(capacity)
         self._callback = callback
         self._key = key
         self.is_closed = False
         self._subscriber: Any
+        self._calls: _Calls | None = None
+        if is_small:
+            self._calls = _Calls(self._take)
+            self._subscriber = self._calls.declare(lambda handler: session.declare_subscriber(key, handler))
+            return
+        capacity = _HISTORY_FIFO_CAPACITY if history else _FIFO_CAPACITY
+        channel: Any = handlers.RingChannel(_LATEST_CAPACITY) if latest_only else handlers.FifoChannel(capacity)
         if history:
             self._subscriber = ext.declare_advanced_subscriber(
                 session,
@@ -149,7 +152,9 @@ class Subscription:
         """Undeclare and wait for the callback that may be under way, if not called from it."""
         self.is_closed = True
         _undeclare(self._subscriber)
-        if threading.current_thread() is not self._thread:
+        if self._calls is not None:
+            self._calls.wait_for_end()
+        elif threading.current_thread() is not self._thread:
             self._thread.join(_JOIN_S)
 
     def _drain(self) -> None:
@@ -158,16 +163,17 @@ class Subscription:
                 received = self._handler.recv()
             except zenoh.ZError:
                 return  # undeclared, or the session was closed
-            if self.is_closed:
-                # Taken to the end all the same: a full channel that nobody reads blocks a thread of Zenoh's for good,
-                # and with it the next session that this process opens.
-                continue
-            if received.kind != zenoh.SampleKind.PUT:
-                continue
-            try:
-                self._callback(_to_sample(received))
-            except Exception:
-                _log.exception("a subscriber's callback failed; the message is passed over", extra={"key": self._key})
+            self._take(received)
+
+    def _take(self, received: zenoh.Sample) -> None:
+        # Taken to the end also when we are closed: a full channel that nobody reads blocks a thread of Zenoh's for
+        # good, and with it the next session that this process opens.
+        if self.is_closed or received.kind != zenoh.SampleKind.PUT:
+            return
+        try:
+            self._callback(_to_sample(received))
+        except Exception:
+            _log.exception("a subscriber's callback failed; the message is passed over", extra={"key": self._key})
 
 
 class LivelinessSubscription:
@@ -176,29 +182,62 @@ class LivelinessSubscription:
     def __init__(self, session: zenoh.Session, key: str, callback: Callable[[str, bool], None]) -> None:
         self.is_closed = False
         self._callback = callback
-        channel: Any = handlers.FifoChannel(_TOKEN_FIFO_CAPACITY)
-        self._subscriber: Any = session.liveliness().declare_subscriber(key, channel, history=True)
-        self._handler = self._subscriber.handler
-        self._thread = threading.Thread(target=self._drain, name=f"drain {key}", daemon=True)
-        self._thread.start()
+        self._calls = _Calls(self._take)
+        self._subscriber = self._calls.declare(
+            lambda handler: session.liveliness().declare_subscriber(key, handler, history=True)
+        )
 
     def close(self) -> None:
         """Undeclare."""
         self.is_closed = True
         _undeclare(self._subscriber)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(_JOIN_S)
+        self._calls.wait_for_end()
 
-    def _drain(self) -> None:
-        while True:
+    def _take(self, received: zenoh.Sample) -> None:
+        try:
+            self._callback(str(received.key_expr), received.kind == zenoh.SampleKind.PUT)
+        except Exception:
+            _log.exception("a liveliness callback failed", extra={"key": str(received.key_expr)})
+
+
+class _Calls:
+    """Calls a function with each message, in a thread that the library starts, one after the other.
+
+    A thread that waits in a channel of ours wakes up ten times a second to look for signals; this one sleeps. But the
+    library lets 256 messages wait for it, whatever their size.
+    """
+
+    def __init__(self, function: Callable[[Any], None]) -> None:
+        self._function = function
+        self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
+
+    def declare(self, declare: Callable[[Any], Any]) -> Any:
+        """Declare something with this handler."""
+        outcome: list[Any] = []
+
+        def run() -> None:
             try:
-                received = self._handler.recv()
-            except zenoh.ZError:
-                return
-            try:
-                self._callback(str(received.key_expr), received.kind == zenoh.SampleKind.PUT)
-            except Exception:
-                _log.exception("a liveliness callback failed", extra={"key": str(received.key_expr)})
+                outcome.append(declare(handlers.Callback(self._call, self._ended.set)))
+            except Exception as error:
+                outcome.append(error)
+
+        # The library's thread is a daemon if ours is: a link that had to be abandoned must not keep the process alive.
+        thread = threading.Thread(target=run, name="declare", daemon=True)
+        thread.start()
+        thread.join()
+        if isinstance(outcome[0], Exception):
+            raise outcome[0]
+        return outcome[0]
+
+    def wait_for_end(self) -> None:
+        """After it was undeclared: wait a moment for the call that may be under way, if not called from it."""
+        if threading.current_thread() is not self._thread:
+            self._ended.wait(_JOIN_S)
+
+    def _call(self, received: Any) -> None:
+        self._thread = threading.current_thread()
+        self._function(received)
 
 
 class Token:

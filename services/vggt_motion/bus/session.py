@@ -223,6 +223,7 @@ class Bus:
         latest_only: bool = False,
         history: bool = False,
         isolated: bool = False,
+        is_small: bool = False,
     ) -> Closable:
         """Deliver the samples of a key to ``callback``, in a thread of ours.
 
@@ -233,9 +234,12 @@ class Bus:
             latest_only: old samples are dropped in favour of the newest: for live views.
             history: first what the publishers keep, and recover what a broken link lost; needs ``history`` there too.
             isolated: over a link of its own, where a slow callback slows down nothing but a blocking publisher.
+            is_small: messages of some kilobytes, of which hundreds may wait; costs less. Without the other options.
         """
         if not isolated:
-            return self._keep(Subscription(self._session, key, callback, latest_only=latest_only, history=history))
+            return self._keep(
+                Subscription(self._session, key, callback, latest_only=latest_only, history=history, is_small=is_small)
+            )
         own = open_bus(self.config)
         own.subscribe(key, callback, latest_only=latest_only, history=history)
         return self._keep(own)

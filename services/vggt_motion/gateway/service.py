@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 import threading
@@ -24,10 +25,11 @@ from vggt_motion.records import BlobRef
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.25
 _STATUS_INTERVAL_S = 1.0
+_LEDGER_INTERVAL_S = 2.0
 _BLOB_PATIENCE_S = 3.0
 _RECORDS_A_TURN = 500
 _SHUTDOWN_S = 1.0
-_HTTP_TICK_S = 0.25
+_HTTP_TICK_S = 1.0
 
 
 def main(config: Config) -> int:
@@ -83,7 +85,7 @@ class _Gateway:
 
     def serve(self) -> None:
         context = self._context
-        log = LogFollower(context.bus, on_status=self._state.set_ledger)
+        log = LogFollower(context.bus, on_status=self._state.set_ledger, interval_s=_LEDGER_INTERVAL_S)
         server = HttpServer(self._app, self._listener)
         server.start()
         _log.info("serving", extra={"url": self.url})
@@ -169,7 +171,7 @@ class HttpServer:
 
     def stop(self) -> None:
         """Finish what is being answered, for a second at most."""
-        self._server.should_exit = True
+        self._server.ask_to_end()
         self._thread.join(_SHUTDOWN_S)
         self._server.force_exit = True
 
@@ -178,10 +180,26 @@ class HttpServer:
 
 
 class _HttpLoop(uvicorn.Server):
+    """Uvicorn's server, whose own loop looks ten times a second whether it shall end."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ending = asyncio.Event()
+
+    def ask_to_end(self) -> None:
+        """From any thread."""
+        self.should_exit = True
+        loop = self._loop
+        if loop is not None:
+            with contextlib.suppress(RuntimeError):  # it has ended already
+                loop.call_soon_threadsafe(self._ending.set)
+
     async def main_loop(self) -> None:
-        # As uvicorn's own, which wakes up ten times a second; 0 renews the date that answers carry.
-        while not await self.on_tick(0):
-            await asyncio.sleep(_HTTP_TICK_S)
+        self._loop = asyncio.get_running_loop()
+        while not await self.on_tick(0):  # 0: renew the date that answers carry
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._ending.wait(), _HTTP_TICK_S)
 
 
 def _reason(error: Exception) -> str:

@@ -45,7 +45,7 @@ MAX_REPORTS = 1_000
 MAX_WAIT_S = 60.0
 MAX_JOB_ID_BYTES = 240  # the id of the event of its death is longer
 MAX_JOB_PAYLOAD_BYTES = 4 * 2**20
-_LONGEST_PAUSE_S = 0.5
+_LONGEST_PAUSE_S = 1.0
 _FINAL = (JobState.DONE, JobState.DEAD, JobState.CANCELLED)
 
 

@@ -7,14 +7,15 @@ keyframes; the others are counted as missing.
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import logging
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
-from vggt_motion.backend.session_map import build_session_map
 from vggt_motion.backend.state import LogState
-from vggt_motion.backend.trajectory import compose
 from vggt_motion.bus import codec
 from vggt_motion.bus.follow import Followed
 from vggt_motion.bus.images import decode_image
@@ -31,8 +32,9 @@ from vggt_motion.errors import (
     RequestRefusedError,
     VggtMotionError,
 )
+from vggt_motion.recorder.payloads import RecentPayloads
 from vggt_motion.recorder.record import FrameId, Recording, RecordingClosedError
-from vggt_motion.recorder.views import ViewWriter
+from vggt_motion.recorder.views import ViewWriter, drawn_map, drawn_trajectory
 from vggt_motion.records import (
     BlobRef,
     GraphUpdate,
@@ -52,7 +54,7 @@ _RECORDS_A_TURN = 100
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
 _BLOB_PATIENCE_S = 2.0
 _VIEW_REST = 9.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
-_VIEW_POINTS = 200_000
+_HELD_BYTES = 64 * 2**20
 
 
 def main(config: Config, *, directory: Path) -> int:
@@ -76,7 +78,8 @@ class _Recorder:
         self._recording = Recording.open(
             path, chunk_bytes=context.config.recorder.chunk_bytes, on_entry=self._remember_entry
         )
-        self._views = _ViewThread(context, self._recording)
+        self._payloads = RecentPayloads(_HELD_BYTES)
+        self._views = _ViewThread(context, self._recording, self._payloads)
         self._failure: OSError | None = None  # of a thread; the main loop ends the service
         self._refused_images = 0
         self._pending_keyframes: dict[str, tuple[Keyframe, int, float]] = {}  # id -> record, sequence, time seen
@@ -156,6 +159,7 @@ class _Recorder:
                 frame_id = FrameId(camera, image.header.epoch, image.header.frame_index)
                 frame = Frame(frame_id.index, image.capture_time_ns, image.encoded, image.media_type)
                 self._recording.add_frame(frame_id, frame)
+                self._payloads.put(frame_id, image.encoded)
         except CodecError as error:
             self._refused_images += 1
             if self._refused_images & (self._refused_images - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
@@ -240,7 +244,9 @@ class _Recorder:
 
     def _fetch(self, ref: BlobRef) -> bytes | None:
         try:
-            return self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)
+            data = self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)
+            self._payloads.put(ref.sha256, data)
+            return data
         except (RequestRefusedError, LedgerError) as error:
             _log.error("payload missing in the recording", extra={"sha256": ref.sha256, "reason": str(error)})
             return None
@@ -305,9 +311,10 @@ class _Recorder:
 class _ViewThread:
     """Makes the views beside the recording: of the newest graph only, and at leisure until the graph is final."""
 
-    def __init__(self, context: ServiceContext, recording: Recording) -> None:
+    def __init__(self, context: ServiceContext, recording: Recording, payloads: RecentPayloads) -> None:
         self._context = context
         self._recording = recording
+        self._payloads = payloads
         self._writer = ViewWriter(recording)
         self._changed = threading.Condition()
         self._offered: LogState | None = None
@@ -372,17 +379,22 @@ class _ViewThread:
         if graph is None:
             return
         backend = self._context.config.backend
-        ids = [(pose.submap_index, pose.submap_revision) for pose in graph.poses]
-        submaps = {index: log.submaps[index, revision] for index, revision in ids if (index, revision) in log.submaps}
-        segments = [log.segments[index] for index in sorted(log.segments)]
-        trajectory = compose(
-            list(log.keyframes.values()), segments, submaps, graph, known_distance_m=backend.known_distance_m
-        )
+        trajectory = drawn_trajectory(log, graph, backend)
         self._writer.add_trajectory(trajectory)
         if self._writer.wants_map(trajectory):
-            small = backend.model_copy(update={"map_max_points": min(backend.map_max_points, _VIEW_POINTS)})
-            points = build_session_map(log.keyframes, submaps, graph, trajectory, small, self._read_blob)
-            self._writer.add_map(points, trajectory)
+            frame_ids = {
+                keyframe.image.sha256: FrameId(keyframe.camera, keyframe.epoch, keyframe.frame_index)
+                for keyframe in log.keyframes.values()
+            }
+            read_blob = functools.partial(self._read_blob, frame_ids)
+            self._writer.add_map(drawn_map(log, graph, trajectory, backend, read_blob), trajectory)
 
-    def _read_blob(self, ref: BlobRef) -> bytes:
+    def _read_blob(self, frame_ids: Mapping[str, FrameId], ref: BlobRef) -> bytes:
+        """A payload; ``frame_ids`` says which frame an image is, by its SHA-256."""
+        held = self._payloads.get(ref.sha256)
+        if held is not None:
+            return held
+        frame = self._payloads.get(frame_ids.get(ref.sha256))
+        if frame is not None and hashlib.sha256(frame).hexdigest() == ref.sha256:
+            return frame
         return self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)

@@ -7,16 +7,54 @@ of them, and not its square.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from vggt_motion import foxglove
 from vggt_motion.backend.map import PointMap
-from vggt_motion.backend.session_map import main_component
-from vggt_motion.backend.trajectory import Trajectory, TrajectoryPose
+from vggt_motion.backend.session_map import build_session_map, main_component
+from vggt_motion.backend.state import LogState
+from vggt_motion.backend.trajectory import Trajectory, TrajectoryPose, compose
+from vggt_motion.config import BackendConfig
 from vggt_motion.recorder.record import MAP_TOPIC, TRAJECTORY_TOPIC, FrameId, Recording
+from vggt_motion.records import BlobRef, GraphUpdate, SubmapGeometry
 
 _TRAJECTORY_GROWTH = 1.1
 _MAP_GROWTH = 1.5
+_VIEW_POINTS = 200_000
+
+
+def drawn_trajectory(log: LogState, graph: GraphUpdate, config: BackendConfig) -> Trajectory:
+    """The trajectory that a graph of a log gives; pure computation."""
+    return compose(
+        list(log.keyframes.values()),
+        [log.segments[index] for index in sorted(log.segments)],
+        _submaps(log, graph),
+        graph,
+        known_distance_m=config.known_distance_m,
+    )
+
+
+def drawn_map(
+    log: LogState,
+    graph: GraphUpdate,
+    trajectory: Trajectory,
+    config: BackendConfig,
+    read_blob: Callable[[BlobRef], bytes],
+) -> PointMap:
+    """The map for viewers, smaller than that of the results; pure computation but for ``read_blob``.
+
+    Raises:
+        CodecError: an image or a depth payload cannot be decoded.
+    """
+    small = config.model_copy(update={"map_max_points": min(config.map_max_points, _VIEW_POINTS)})
+    return build_session_map(log.keyframes, _submaps(log, graph), graph, trajectory, small, read_blob)
+
+
+def _submaps(log: LogState, graph: GraphUpdate) -> dict[int, SubmapGeometry]:
+    ids = [(pose.submap_index, pose.submap_revision) for pose in graph.poses]
+    return {index: log.submaps[index, revision] for index, revision in ids if (index, revision) in log.submaps}
 
 
 class ViewWriter:
