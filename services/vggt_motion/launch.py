@@ -234,7 +234,7 @@ class LocalRun:
             supervisor.start([command.label for command in commands if command.name != "frontend"])
             bus = self._join(supervisor)
             try:
-                watch = ServiceWatch(bus)
+                watch = ServiceWatch(bus, reports_of=("frontend", "recorder"))
                 self._wait_for(supervisor, watch, commands)
                 start_up_seconds = time.monotonic() - begin
                 supervisor.start(["frontend"])

@@ -10,10 +10,10 @@ The folder must be on a real disk: in memory an fsync costs nothing. A round mea
 rounds are repeated, so that a disk that has a bad minute has it for all.
 
 Then one ``vggt-motion run`` of a source, whose processes are watched. Numerics are the computing children, the pixels
-in the frontend (what the pure pipeline needs for the same frames in this process), the maps in the recording (what the
-pure functions need for the same graphs in this process, payloads at hand) and the results that ``run`` writes after the
-final graph; everything else after start-up is fabric. Start-up is what a process used before the frontend was started,
-and for the frontend what it used before its first record.
+in the frontend (what the pure pipeline needs for the same frames in this process), the trajectories and maps in the
+recording (what the pure functions need for the same graphs in this process, payloads at hand) and the results that
+``run`` writes after the final graph; everything else after start-up is fabric. Start-up is what a process used before
+the frontend was started, and for the frontend what it used before its first record.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from vggt_motion.ledger.admission import admitted
 from vggt_motion.ledger.service import open_session
 from vggt_motion.ledger.sqlite import read_only
 from vggt_motion.recorder.container import McapScanner
-from vggt_motion.recorder.record import MAP_TOPIC
+from vggt_motion.recorder.record import MAP_TOPIC, TRAJECTORY_TOPIC
 from vggt_motion.recorder.views import drawn_map, drawn_trajectory
 from vggt_motion.records import Event, GraphUpdate, JobKind, Keyframe, Stream, SubmapSpec, segment_index_of
 from vggt_motion.sources.registry import open_source
@@ -360,8 +360,8 @@ def pixel_seconds(source: str) -> float:
     return time.process_time() - begin
 
 
-def map_seconds(out: Path) -> float:
-    """CPU seconds of the pure functions that draw the maps in a run's recording, payloads at hand."""
+def view_seconds(out: Path) -> float:
+    """CPU seconds of the pure functions that make the trajectories and maps of a recording, payloads at hand."""
     cv2.setNumThreads(1)
     config = Config().backend
     session = StoredSession(out / "ledger")
@@ -369,17 +369,19 @@ def map_seconds(out: Path) -> float:
     with read_only(out / "ledger" / "ledger.db") as reader:
         graphs = [codec.decode(GraphUpdate, row.payload) for row in reader.records(Stream.GRAPH.value, 0, 10**6)]
     of_revision = {graph.revision: graph for graph in graphs}  # of two of one number, the final one came last
-    revisions = [m.sequence for m in McapScanner(out / "run.mcap").messages() if m.channel.topic == MAP_TOPIC]
+    drawn = [(message.channel.topic, message.sequence) for message in McapScanner(out / "run.mcap").messages()]
     payloads = {frame.depth: b"" for geometry in log.submaps.values() for frame in geometry.frames}
     payloads |= {keyframe.image: b"" for keyframe in log.keyframes.values()}
     payloads = {ref: session.load_blob(ref) for ref in payloads}
     begin = time.process_time()
-    for revision in revisions:
+    for revision in sorted({revision for topic, revision in drawn if topic in (MAP_TOPIC, TRAJECTORY_TOPIC)}):
         graph = of_revision[revision]
         newest = max(segment_index_of(pose.submap_index) for pose in graph.poses)
         segments = {index: segment for index, segment in log.segments.items() if index <= newest}
         then = replace(log, segments=segments)
-        drawn_map(then, graph, drawn_trajectory(then, graph, config), config, payloads.__getitem__)
+        trajectory = drawn_trajectory(then, graph, config)
+        if (MAP_TOPIC, revision) in drawn:
+            drawn_map(then, graph, trajectory, config, payloads.__getitem__)
     return time.process_time() - begin
 
 
@@ -416,7 +418,7 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
     used = {name: seconds - start_up.get(name, 0.0) for name, seconds in watched.by_name().items()}
     numerics = {name: seconds for name, seconds in used.items() if name.endswith(" compute")}
     numerics["frontend"] = min(pixel_seconds(source), used["frontend"])
-    numerics["recorder"] = min(map_seconds(out), used["recorder"])
+    numerics["recorder"] = min(view_seconds(out), used["recorder"])
     numerics["run"] = max(0.0, used["run"] - (run_until_graph - start_up.get("run", 0.0)))
     row = {f"{name}_fabric_s": round(used[name] - numerics.get(name, 0.0), 3) for name in used if name not in numerics}
     row |= {f"{name}_fabric_s": used[name] - numerics[name] for name in ("frontend", "recorder", "run")}

@@ -21,7 +21,7 @@ from vggt_motion.errors import BusUnavailableError, DiskFullError, RequestRefuse
 from vggt_motion.records import Constraint, GraphUpdate, Job, JobKind, Keyframe, Segment, Stream
 
 _log = logging.getLogger(__name__)
-_IDLE_S = 0.25
+_IDLE_S = 1.0
 _RETRY_S = 0.5
 _MAX_SOLVE_FAILURES = 3
 
@@ -48,11 +48,12 @@ class _Backend:
         self._solve_failures = 0
 
     def serve(self) -> None:
+        self._context.stopping.wakes(self._log.wake)
         try:
             self._child.start()  # its imports take longer than the first submap should wait for
             while not self._context.stopping.is_set():
                 if not self._pump() and not self._solve():
-                    self._log.wait(_IDLE_S)
+                    self._log.wait(_RETRY_S if self._has_unsubmitted else _IDLE_S)
         except ComputeCancelledError:
             return
         finally:

@@ -68,9 +68,9 @@ class Keys:
         """Health of one process, once a second: HealthReport."""
         return f"{self.prefix}/health/{_checked(service)}/{_checked(instance)}"
 
-    def all_health(self) -> str:
-        """Health of all processes."""
-        return f"{self.prefix}/health/*/*"
+    def all_health(self, service: str | None = None) -> str:
+        """Health of all processes, or of those of one service."""
+        return f"{self.prefix}/health/{'*' if service is None else _checked(service)}/*"
 
 
 def service_of(key: str) -> tuple[str, str]:

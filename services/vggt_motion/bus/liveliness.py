@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from vggt_motion.bus import codec
 from vggt_motion.bus.keys import service_of
@@ -84,8 +84,13 @@ class ServiceWatch:
     Reports come once a second from each and are asked for seldom: they are decoded when they are.
     """
 
-    def __init__(self, bus: Bus) -> None:
-        """Start to watch."""
+    def __init__(self, bus: Bus, reports_of: Sequence[str] | None = None) -> None:
+        """Start to watch.
+
+        Args:
+            bus: joined.
+            reports_of: services whose reports are wanted; None: of all.
+        """
         self._changed = threading.Condition()
         self._alive: set[tuple[str, str]] = set()
         # With the monotonic time of arrival.
@@ -93,7 +98,14 @@ class ServiceWatch:
         self._unread: dict[tuple[str, str], tuple[bytes, float]] = {}
         self._subscriptions: list[Closable] = [
             bus.watch_liveliness(bus.keys.all_alive(), self._on_token),
-            bus.subscribe(bus.keys.all_health(), self._on_health, is_small=True),
+            *(
+                bus.subscribe(key, self._on_health, is_small=True)
+                for key in (
+                    [bus.keys.all_health()]
+                    if reports_of is None
+                    else [bus.keys.all_health(service) for service in reports_of]
+                )
+            ),
         ]
 
     def services(self) -> dict[tuple[str, str], HealthReport | None]:

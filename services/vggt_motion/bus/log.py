@@ -70,6 +70,10 @@ class LogFollower:
         self._news.clear()
         return has_news
 
+    def wake(self) -> None:
+        """End a :meth:`wait` that is under way; from any thread."""
+        self._news.set()
+
     def poll(self) -> list[LogRecord]:
         """What is new since the last call; does not wait."""
         records: list[LogRecord] = []

@@ -33,10 +33,31 @@ _DEFECT_EXIT_CODE = 1
 _SignalHandler = Callable[[int, FrameType | None], object] | int | signal.Handlers | None
 
 
+class StopEvent(threading.Event):
+    """Set once; then it also wakes up who waits for something else."""
+
+    def __init__(self) -> None:
+        """Not set."""
+        super().__init__()
+        self._wakers: list[Callable[[], None]] = []
+
+    def set(self) -> None:
+        """Set it, and call every waker."""
+        super().set()
+        for wake in tuple(self._wakers):
+            wake()
+
+    def wakes(self, wake: Callable[[], None]) -> None:
+        """Call ``wake`` when it is set, or now if it is; from any thread, must not block."""
+        self._wakers.append(wake)
+        if self.is_set():
+            wake()
+
+
 class ServiceContext:
     """What a service works with."""
 
-    def __init__(self, service: str, instance: str, config: Config, bus: Bus, stopping: threading.Event) -> None:
+    def __init__(self, service: str, instance: str, config: Config, bus: Bus, stopping: StopEvent) -> None:
         """Join the parts; made by :func:`run_service`."""
         self.service = service
         self.instance = instance
@@ -132,7 +153,7 @@ def run_service(
     """
     instance = instance or make_instance()
     set_up_logging(name, instance)
-    stopping = threading.Event()
+    stopping = StopEvent()
     bus: Bus | None = None
     failure = ""
     exit_code = 0

@@ -23,7 +23,6 @@ from vggt_motion.gateway.state import GatewayState
 from vggt_motion.records import BlobRef
 
 _log = logging.getLogger(__name__)
-_IDLE_S = 0.25
 _STATUS_INTERVAL_S = 1.0
 _LEDGER_INTERVAL_S = 2.0
 _BLOB_PATIENCE_S = 3.0
@@ -86,6 +85,7 @@ class _Gateway:
     def serve(self) -> None:
         context = self._context
         log = LogFollower(context.bus, on_status=self._state.set_ledger, interval_s=_LEDGER_INTERVAL_S)
+        context.stopping.wakes(log.wake)
         server = HttpServer(self._app, self._listener)
         server.start()
         _log.info("serving", extra={"url": self.url})
@@ -99,7 +99,7 @@ class _Gateway:
                     next_report = time.monotonic() + _STATUS_INTERVAL_S
                     self._report(log)
                 if count == 0:
-                    log.wait(_IDLE_S)
+                    log.wait(_STATUS_INTERVAL_S)
         finally:
             # Live clients first: the server waits for open answers.
             self._state.hub.close()

@@ -53,7 +53,8 @@ RESULT_STREAMS: Final = {
     JobKind.PREDICT.value: Stream.SUBMAP.value,
     JobKind.REGISTER.value: Stream.CONSTRAINT.value,
 }
-_TICK_S = 0.25
+_TICK_S = 0.5
+_TICKS_PER_LEASE = 8
 _HEALTH_S = 1.0
 _SIZES_S = 5.0  # the sum over all blobs is not asked for more often
 _HISTORY = 16
@@ -160,7 +161,8 @@ def _open(context: ServiceContext, directory: Path) -> Ledger | None:
 def _watch(context: ServiceContext, ledger: Ledger, desk: Desk, presence: Presence, publisher: LogPublisher) -> None:
     """The loop of the service: leases, and health."""
     next_health_s = 0.0
-    while not context.stopping.wait(_TICK_S):
+    tick_s = min(_TICK_S, context.config.ledger.lease_duration_s / _TICKS_PER_LEASE)
+    while not context.stopping.wait(tick_s):
         if desk.failure is not None:
             raise desk.failure
         is_connected = context.bus.is_connected

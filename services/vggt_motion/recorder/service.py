@@ -48,12 +48,12 @@ from vggt_motion.sources.source import Frame
 
 _log = logging.getLogger(__name__)
 RECORDING_FILE = "run.mcap"
-_IDLE_S = 0.25
 _REPORT_S = 0.5
 _RECORDS_A_TURN = 100
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
 _BLOB_PATIENCE_S = 2.0
 _VIEW_REST = 9.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
+_VIEW_IDLE_S = 5.0
 _HELD_BYTES = 64 * 2**20
 
 
@@ -94,6 +94,7 @@ class _Recorder:
         images = context.bus.subscribe(context.bus.keys.all_images(), self._on_image, history=True, isolated=True)
         positions = {stream: self._recording.position(stream.value) for stream in RECORD_OF_STREAM}
         follower = LogFollower(context.bus, positions)
+        context.stopping.wakes(follower.wake)
         self._views.start()
         try:
             next_report, was_complete = 0.0, False
@@ -107,7 +108,7 @@ class _Recorder:
                     # a change of state is sent at once: whoever waits for the recording waits no longer than it takes
                     self._report("idle" if is_complete else "working")
                 if count == 0:
-                    follower.wait(_IDLE_S)
+                    follower.wait(_REPORT_S)
             self._follow(follower, keep_going=False)
         except OSError as error:
             self._failure = error
@@ -344,7 +345,7 @@ class _ViewThread:
         while not self._context.stopping.is_set():
             with self._changed:
                 if self._offered is None:
-                    self._changed.wait(0.5)
+                    self._changed.wait(_VIEW_IDLE_S)
                     continue
                 log, self._offered = self._offered, None
                 graph = log.latest_graph()
