@@ -37,7 +37,6 @@ from vggt_motion.recorder.record import FrameId, Recording, RecordingClosedError
 from vggt_motion.recorder.views import ViewWriter, drawn_map, drawn_trajectory
 from vggt_motion.records import (
     BlobRef,
-    GraphUpdate,
     Keyframe,
     LogEntry,
     Segment,
@@ -205,6 +204,7 @@ class _Recorder:
     def _follow(self, log: LogFollower, *, keep_going: bool = True) -> int:
         """Write what has come, a bounded number of records a turn; returns how many."""
         count = 0
+        is_new_graph = is_more_of_it = False
         for stream, follower in log.followers.items():
             for _ in range(_RECORDS_A_TURN):
                 followed = self._held.pop(stream, None) or follower.next(0.0)
@@ -216,6 +216,12 @@ class _Recorder:
                     self._held[stream] = followed
                     break
                 count += 1
+                is_new_graph |= stream is Stream.GRAPH
+                is_more_of_it |= stream in (Stream.KEYFRAME, Stream.SEGMENT, Stream.SUBMAP)
+        graph = self._log.latest_graph()
+        # The streams are not ordered mutually: what the final graph speaks of may come after it.
+        if graph is not None and (is_new_graph or (is_more_of_it and graph.is_final)):
+            self._views.offer(self._log)
         return count
 
     def _record(self, followed: Followed[LogRecord]) -> None:
@@ -238,8 +244,6 @@ class _Recorder:
                 self._expect_frame(record, followed.sequence)
             case Segment():
                 self._expect_segment(record)
-            case GraphUpdate():
-                self._views.offer(self._log)
             case _:
                 pass
 

@@ -63,7 +63,7 @@ class ViewWriter:
     def __init__(self, recording: Recording) -> None:
         """Views of a recording; what an earlier process wrote into it is not written again."""
         self._recording = recording
-        self._written: dict[str, tuple[int, bool]] = {}  # topic -> keyframes, is final; by this process
+        self._written: dict[str, tuple[int, bool]] = {}  # topic -> posed keyframes, is final; by this process
 
     def add_trajectory(self, trajectory: Trajectory) -> None:
         """Write the poses of new keyframes and, when it has grown enough or is final, the whole trajectory.
@@ -103,11 +103,12 @@ class ViewWriter:
             return self._recording.view_revision(topic) != trajectory.graph_revision
         size, was_final = written
         if trajectory.is_final:
-            return not was_final
-        return len(trajectory.keyframes) > size and len(trajectory.keyframes) >= growth * size
+            # Once more where the end had come before all that it speaks of.
+            return not was_final or _posed_count(trajectory) > size
+        return _posed_count(trajectory) > size and _posed_count(trajectory) >= growth * size
 
     def _note(self, trajectory: Trajectory, topic: str) -> None:
-        self._written[topic] = (len(trajectory.keyframes), trajectory.is_final)
+        self._written[topic] = (_posed_count(trajectory), trajectory.is_final)
 
     def _add_pose(self, frame: TrajectoryPose) -> None:
         frame_id = FrameId(frame.camera, frame.epoch, frame.frame_index)
@@ -125,6 +126,10 @@ class ViewWriter:
         time_ns = _last_time_ns(frames)
         message = foxglove.poses_in_frame(poses, foxglove.world_frame(component), time_ns)
         self._recording.add_trajectory(trajectory.graph_revision, message, time_ns)
+
+
+def _posed_count(trajectory: Trajectory) -> int:
+    return sum(frame.world_from_camera is not None for frame in trajectory.keyframes)
 
 
 def _time_ns(frame: TrajectoryPose) -> int:
