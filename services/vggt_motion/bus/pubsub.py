@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import zenoh
 from zenoh import ext, handlers
 
+from vggt_motion.bus.delivery import Calls
 from vggt_motion.errors import BusError, BusUnavailableError
 
 _log = logging.getLogger(__name__)
@@ -125,9 +126,9 @@ class Subscription:
         self._key = key
         self.is_closed = False
         self._subscriber: Any
-        self._calls: _Calls | None = None
+        self._calls: Calls | None = None
         if is_small:
-            self._calls = _Calls(self._take)
+            self._calls = Calls(self._take)
             self._subscriber = self._calls.declare(lambda handler: session.declare_subscriber(key, handler))
             return
         capacity = _HISTORY_FIFO_CAPACITY if history else _FIFO_CAPACITY
@@ -182,7 +183,7 @@ class LivelinessSubscription:
     def __init__(self, session: zenoh.Session, key: str, callback: Callable[[str, bool], None]) -> None:
         self.is_closed = False
         self._callback = callback
-        self._calls = _Calls(self._take)
+        self._calls = Calls(self._take)
         self._subscriber = self._calls.declare(
             lambda handler: session.liveliness().declare_subscriber(key, handler, history=True)
         )
@@ -198,46 +199,6 @@ class LivelinessSubscription:
             self._callback(str(received.key_expr), received.kind == zenoh.SampleKind.PUT)
         except Exception:
             _log.exception("a liveliness callback failed", extra={"key": str(received.key_expr)})
-
-
-class _Calls:
-    """Calls a function with each message, in a thread that the library starts, one after the other.
-
-    A thread that waits in a channel of ours wakes up ten times a second to look for signals; this one sleeps. But the
-    library lets 256 messages wait for it, whatever their size.
-    """
-
-    def __init__(self, function: Callable[[Any], None]) -> None:
-        self._function = function
-        self._thread: threading.Thread | None = None
-        self._ended = threading.Event()
-
-    def declare(self, declare: Callable[[Any], Any]) -> Any:
-        """Declare something with this handler."""
-        outcome: list[Any] = []
-
-        def run() -> None:
-            try:
-                outcome.append(declare(handlers.Callback(self._call, self._ended.set)))
-            except Exception as error:
-                outcome.append(error)
-
-        # The library's thread is a daemon if ours is: a link that had to be abandoned must not keep the process alive.
-        thread = threading.Thread(target=run, name="declare", daemon=True)
-        thread.start()
-        thread.join()
-        if isinstance(outcome[0], Exception):
-            raise outcome[0]
-        return outcome[0]
-
-    def wait_for_end(self) -> None:
-        """After it was undeclared: wait a moment for the call that may be under way, if not called from it."""
-        if threading.current_thread() is not self._thread:
-            self._ended.wait(_JOIN_S)
-
-    def _call(self, received: Any) -> None:
-        self._thread = threading.current_thread()
-        self._function(received)
 
 
 class Token:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 import time
 from collections import deque
@@ -14,6 +15,7 @@ import zenoh
 from zenoh import handlers
 
 from vggt_motion.bus import calls, codec
+from vggt_motion.bus.delivery import Calls
 from vggt_motion.errors import (
     BusUnavailableError,
     CodecError,
@@ -45,11 +47,10 @@ class _Request:
 
 
 class Server:
-    """One queryable with its threads; they are started as they are needed, up to one more than may answer at a time.
+    """One queryable with its threads; they are started as they are needed.
 
-    Every thread receives and answers, so that a query costs no change of thread. One that comes while enough others
-    answer lets its query wait, or refuses it when there are too many, and receives on: somebody always does, for a
-    channel that fills holds up everything on its link.
+    Queries are taken in at once and wait for a thread, or are refused when too many wait: a channel that fills holds
+    up everything on its link. How they are taken in is a matter of the subclass.
     """
 
     def __init__(
@@ -72,14 +73,9 @@ class Server:
         self._waiting: deque[_Request] = deque()
         self._held_bytes = 0  # of requests that are not answered yet
         self._answering = 0
-        self._receiving = 0
-        self.is_closed = False
-        channel: Any = handlers.FifoChannel(_FIFO_CAPACITY)
-        self._queryable: Any = session.declare_queryable(key, channel, complete=True)
-        self._channel = self._queryable.handler
         self._threads: list[threading.Thread] = []
-        with self._lock:
-            self._start()
+        self.is_closed = False
+        self._queryable = self._declare(session)
 
     def begin_close(self) -> None:
         """Take no more queries and refuse those that wait."""
@@ -101,49 +97,33 @@ class Server:
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))
 
+    def _declare(self, session: zenoh.Session) -> Any:
+        raise NotImplementedError
+
+    def _work(self) -> None:
+        raise NotImplementedError
+
     def _start(self) -> None:
         """One thread more; with the lock."""
-        self._receiving += 1
         thread = threading.Thread(target=self._work, name=f"serve {self._key}", daemon=True)
         self._threads.append(thread)
         thread.start()
 
-    def _work(self) -> None:
-        while True:
-            try:
-                query = self._channel.recv()
-            except zenoh.ZError:
-                return
-            batch = self._take(query)
-            del query
-            while batch:
-                try:
-                    self._answer(batch)
-                finally:
-                    with self._lock:
-                        self._held_bytes -= sum(request.size_bytes for request in batch)
-                        batch = self._next_batch()
-
-    def _take(self, query: zenoh.Query) -> list[_Request]:
-        """Take a query in; returns what this thread is to answer now."""
+    def _admit(self, query: zenoh.Query) -> bool:
+        """Let a query wait, if there is room; with the lock."""
         size_bytes = len(query.payload) if query.payload is not None else 0
-        with self._lock:
-            is_full = len(self._waiting) >= _MAX_PENDING or self._held_bytes + size_bytes > _MAX_PENDING_BYTES
-            if not (is_full or self.is_closed):
-                self._held_bytes += size_bytes
-                self._waiting.append(_Request(query, size_bytes))
-                if self._answering >= self._max_answering:
-                    return []
-                self._answering += 1
-                self._receiving -= 1
-                if self._receiving == 0 and len(self._threads) <= self._max_answering:
-                    self._start()
-                return self._next_batch()
+        is_full = len(self._waiting) >= _MAX_PENDING or self._held_bytes + size_bytes > _MAX_PENDING_BYTES
+        if is_full or self.is_closed:
+            return False
+        self._held_bytes += size_bytes
+        self._waiting.append(_Request(query, size_bytes))
+        return True
+
+    def _turn_away(self, query: zenoh.Query) -> None:
         _refuse(query, RefusalCode.UNAVAILABLE, "stopping" if self.is_closed else "overloaded, try again later")
-        return []
 
     def _next_batch(self) -> list[_Request]:
-        """What waits, as much as fits into a batch; nothing: this thread is to receive again. With the lock."""
+        """What waits, as much as fits into a batch; nothing: the thread answers no more. With the lock."""
         batch: list[_Request] = []
         size_bytes = 0
         while self._waiting and len(batch) < (self._at_a_time or 1):
@@ -151,10 +131,18 @@ class Server:
             if batch and size_bytes > _MAX_BATCH_BYTES:
                 break
             batch.append(self._waiting.popleft())
-        if not batch:
-            self._answering -= 1
-            self._receiving += 1
+        self._answering -= not batch
         return batch
+
+    def _answer_all(self, batch: list[_Request]) -> None:
+        """Answer a batch, and what waits then, until nothing does."""
+        while batch:
+            try:
+                self._answer(batch)
+            finally:
+                with self._lock:
+                    self._held_bytes -= sum(request.size_bytes for request in batch)
+                    batch = self._next_batch()
 
     def _answer(self, batch: Sequence[_Request]) -> None:
         requests: list[tuple[zenoh.Query, str, bytes]] = []
@@ -177,6 +165,86 @@ class Server:
             outcomes = [error] * len(requests)
         for (query, key, payload), outcome in zip(requests, outcomes, strict=True):
             _reply(query, key, outcome, len(payload))
+
+
+class SleepingServer(Server):
+    """Takes queries in with a thread of Zenoh's, which sleeps until there is one, and wakes one of ours to answer."""
+
+    def _declare(self, session: zenoh.Session) -> Any:
+        self._wake_ups: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        calls = Calls(self._take)
+        return calls.declare(lambda handler: session.declare_queryable(self._key, handler, complete=True))
+
+    def begin_close(self) -> None:
+        """As in any server; wakes the threads, so that they end."""
+        super().begin_close()
+        with self._lock:
+            for _ in self._threads:
+                self._wake_ups.put(False)
+
+    def _take(self, query: zenoh.Query) -> None:
+        with self._lock:
+            is_taken = self._admit(query)
+            if is_taken and self._answering < self._max_answering:
+                self._answering += 1
+                self._wake_ups.put(True)
+                if len(self._threads) < self._answering:
+                    self._start()
+        if not is_taken:
+            self._turn_away(query)
+
+    def _work(self) -> None:
+        while self._wake_ups.get():
+            with self._lock:
+                batch = self._next_batch()
+            self._answer_all(batch)
+
+
+class PromptServer(Server):
+    """Every thread receives and answers, so that a query costs no change of thread.
+
+    A thread that waits in a channel of ours wakes up ten times a second, whether there is a query or not. There is one
+    thread more than may answer at a time: one that receives while enough others answer lets the query wait and receives
+    on.
+    """
+
+    def _declare(self, session: zenoh.Session) -> Any:
+        self._receiving = 0
+        channel: Any = handlers.FifoChannel(_FIFO_CAPACITY)
+        queryable: Any = session.declare_queryable(self._key, channel, complete=True)
+        self._channel = queryable.handler
+        with self._lock:
+            self._receiving += 1
+            self._start()
+        return queryable
+
+    def _work(self) -> None:
+        while True:
+            try:
+                query = self._channel.recv()
+            except zenoh.ZError:
+                return
+            batch = self._take(query)
+            del query
+            if batch:
+                self._answer_all(batch)
+                with self._lock:
+                    self._receiving += 1
+
+    def _take(self, query: zenoh.Query) -> list[_Request]:
+        """Take a query in; returns what this thread is to answer now."""
+        with self._lock:
+            is_taken = self._admit(query)
+            if is_taken and self._answering < self._max_answering:
+                self._answering += 1
+                self._receiving -= 1
+                if self._receiving == 0 and len(self._threads) <= self._max_answering:
+                    self._receiving += 1
+                    self._start()
+                return self._next_batch()
+        if not is_taken:
+            self._turn_away(query)
+        return []
 
 
 def refusal_code(error: VggtMotionError) -> RefusalCode:

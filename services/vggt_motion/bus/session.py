@@ -28,7 +28,15 @@ from vggt_motion.bus.pubsub import (
     Subscription,
     Token,
 )
-from vggt_motion.bus.serving import REFUSAL_ENCODING, BatchHandler, Handler, Server, error_of
+from vggt_motion.bus.serving import (
+    REFUSAL_ENCODING,
+    BatchHandler,
+    Handler,
+    PromptServer,
+    Server,
+    SleepingServer,
+    error_of,
+)
 from vggt_motion.config import BusConfig
 from vggt_motion.errors import BusError, BusUnavailableError, CodecError, ConfigurationError
 
@@ -195,14 +203,14 @@ class Bus:
         VggtMotionError that it raises becomes an error reply. Waiting requests are bounded; beyond that they are
         refused as unavailable.
         """
-        return self._keep(Server(self._session, key, handler, threads=threads, at_a_time=None))
+        return self._keep(SleepingServer(self._session, key, handler, threads=threads, at_a_time=None))
 
     def serve_together(self, key: str, handler: BatchHandler, *, at_a_time: int, threads: int = 1) -> Closable:
-        """As :meth:`serve`, of up to ``at_a_time`` requests that came while others were being answered.
+        """As :meth:`serve`, of up to ``at_a_time`` requests that came while others were being answered, and promptly.
 
         ``handler(payloads)`` returns for each, in order, its answer or the exception that becomes its error reply.
         """
-        return self._keep(Server(self._session, key, handler, threads=threads, at_a_time=at_a_time))
+        return self._keep(PromptServer(self._session, key, handler, threads=threads, at_a_time=at_a_time))
 
     def publisher(self, key: str, *, blocking: bool, history: int = 0, encoding: str = "") -> Publisher:
         """A publisher on a key.
