@@ -206,7 +206,7 @@ def test_the_job_of_a_killed_worker_is_open_at_once(tmp_path: Path) -> None:
 def test_the_late_result_of_a_frozen_worker_is_taken_once(tmp_path: Path) -> None:
     with site(tmp_path, "ledger.lease_duration_s=1.5", "bus.lease_s=60") as running:
         running.jobs().submit([predict(0)])
-        frozen = running.start("worker", "1.0")
+        frozen = running.start("worker", "4.0")
         wait_until(lambda: running.job_state("submap/000000/r1") == "leased")
         frozen.send(signal.SIGSTOP)  # its link stays up: only its silence tells
         wait_until(lambda: running.job_state("submap/000000/r1") == "open")
