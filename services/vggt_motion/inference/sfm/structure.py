@@ -36,7 +36,7 @@ _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong disto
 _CAPPED_PX = 1.5  # an observation that misses by more belongs to something else, however far it misses
 _MIN_FRAME_OBSERVATIONS = 15
 # kernel px, gate px, iterations, tolerance
-_STAGES = ((2.0, 12.0, 15, 1e-3), (1.0, 5.0, 15, 1e-3), (0.5, 2.5, 20, 1e-4))
+_STAGES = ((2.0, 12.0, 15, 1e-3), (1.0, 5.0, 15, 1e-3), (0.5, 2.5, 25, 1e-5))
 _POLISH = ((0.5, 2.5, 15, 1e-5), (0.3, 1.5, 60, 1e-6))
 
 
