@@ -25,6 +25,12 @@ STOP_MAX_FRAMES = 10_000  # a longer stop gets a boundary in between, or a parke
 
 ROTATION_WEIGHT = 0.3  # a common shift of 20 px at the default threshold: 6 degrees with KITTI's lens
 
+# A truck ahead that fills half of the view: up to the median the displacements are its own, far below those of the rest
+COMPANION_SHARE = 0.4
+COMPANION_RATIO = (
+    8.0  # of the upper quartile to that quantile; on open roads it is not reached before a keyframe is due
+)
+
 _STRIDE = 2  # every second cell in both directions: 480 points at 320x97, of which a median needs no more
 _RESEED_SHARE = 0.7  # of the points; with fewer left their middle is what few outliers say
 
@@ -87,6 +93,9 @@ class ParallaxTracker:
     and tells nothing about depth. With the plain median a turn makes every frame a keyframe, with a baseline of 0.4 m
     on KITTI 00 where straight driving has 2 m; without the shift a camera that only rotates would never get one.
 
+    Behind a truck that fills half of the view the median is the truck's, which hardly moves, while the rest rushes by.
+    Where the displacements part like that, far more than depth makes them, their upper quartile stands for the median.
+
     Points that have left the image are the near ones; they rank above those that are left. Without them the median
     would come to a halt at what the horizon moves, as it did for a second on a motorway. When too many have left,
     what was reached is kept and new points are laid.
@@ -138,8 +147,11 @@ class ParallaxTracker:
         displacement = self._positions - self._seeds
         common_x, common_y = median(displacement[:, 0]), median(displacement[:, 1])
         lengths = np.hypot(displacement[:, 0] - common_x, displacement[:, 1] - common_y)
-        middle = min(self._seed_count // 2, len(lengths) - 1)  # of all points, those that have left being the last
-        spread = float(np.partition(lengths, middle)[middle])
+        last = len(lengths) - 1  # quantiles are of all points, those that have left being the last
+        ranks = [min(int(share * self._seed_count), last) for share in (COMPANION_SHARE, 0.5, 0.75)]
+        companion, spread, quartile = (float(length) for length in np.partition(lengths, ranks)[ranks])
+        if quartile > COMPANION_RATIO * companion:
+            spread = quartile
         return self._reached_px + max(spread, ROTATION_WEIGHT * math.hypot(common_x, common_y))
 
     @property
