@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import functools
 import itertools
+import sys
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))  # the hard sequences are made there
+
+import derived_sequences
 
 from vggt_motion.config import Config
 from vggt_motion.evaluation import metrics
@@ -51,6 +56,20 @@ def test_a_sequence_is_as_accurate_as_it_was(data_dir: Path, name: str, ate_m: f
     assert len(track) == len(poses)
     outcome = metrics.evaluate(PoseTrack(track.times_ns, poses), track)
     assert outcome.ate_sim3.position_m.rmse < ate_m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["kitti_06 behind a truck", "kitti_06, a truck for a while", "kitti_06 nearing a truck"]
+)
+def test_a_truck_that_fills_half_of_the_view_neither_breaks_nor_bends_the_drive(
+    data_dir: Path, tmp_path: Path, name: str
+) -> None:
+    folder = derived_sequences.write(name, data_dir, tmp_path)
+    track = track_of(folder.parent, folder.name)
+    poses = read_kitti(folder / "poses.txt").world_from_camera
+    assert len(track) == len(poses)
+    assert metrics.evaluate(PoseTrack(track.times_ns, poses), track).ate_sim3.position_m.rmse < 0.25
 
 
 def speeds_of(track: PoseTrack) -> tuple[Array, Array]:

@@ -71,16 +71,48 @@ def _with_stop(data: Path, name: str, at: int, length: int) -> Frames:
                 yield np.clip(np.rint(noisy), 0, 255).astype(np.uint8), pose
 
 
-def _behind_a_truck(data: Path, name: str) -> Frames:
-    """A truck ahead fills half of the image: it keeps its distance, but for a sway."""
-    back = cv2.resize(sfm_scene.texture(11, 256), (0, 0), fx=1.0, fy=1.0)
+Box = tuple[int, int, int, int]  # left, top, width, height in px
+
+
+def _with_a_truck(data: Path, name: str, box: Callable[[int, int, int], Box | None]) -> Frames:
+    """The back of a truck that moves along, at ``box(index, width, height)`` of each image."""
+    back = sfm_scene.texture(11, 256)
     for index, (image, pose) in enumerate(_recorded(data, name)):
         height, width = image.shape
-        sized = cv2.resize(back, (width // 2 + round(6 * np.sin(0.3 * index)), round(0.86 * height)))
-        left, top = width // 4 + round(5 * np.sin(0.2 * index)), round(0.06 * height)
+        where = box(index, width, height)
         covered = image.copy()
-        covered[top : top + sized.shape[0], left : left + sized.shape[1]] = sized
+        if where is not None:
+            left, top, across, down = where
+            visible = covered[top : top + down, max(left, 0) : max(left + across, 0)]
+            visible[:] = cv2.resize(back, (across, down))[: visible.shape[0], -min(left, 0) :][:, : visible.shape[1]]
         yield covered, pose
+
+
+def _ahead(index: int, width: int, height: int) -> Box:
+    """Half of the image: it keeps its distance, but for a sway."""
+    sway = round(5 * np.sin(0.2 * index))
+    across = width // 2 + round(6 * np.sin(0.3 * index))
+    return width // 4 + sway, round(0.06 * height), across, round(0.86 * height)
+
+
+def _beside(index: int, width: int, height: int) -> Box:
+    """The left half, as on the next lane."""
+    return round(5 * np.sin(0.2 * index)) - 10, round(0.06 * height), width // 2 + 10, round(0.86 * height)
+
+
+def _for_a_while(index: int, width: int, height: int) -> Box | None:
+    """Comes in from the left within a second, stays ahead for a second, goes on to the right."""
+    if not 10 <= index <= 40:
+        return None
+    left, top, across, down = _ahead(index, width, height)
+    return left - max(20 - index, 0) * width // 14 + max(index - 30, 0) * width // 14, top, across, down
+
+
+def _nearing(index: int, width: int, height: int) -> Box:
+    """At first a quarter of the area, in the end twice as much and more."""
+    across = round(width * (0.35 + 0.005 * index + 0.004 * np.sin(0.3 * index)))
+    down = round(height * (0.62 + 0.005 * index))
+    return (width - across) // 2 + round(5 * np.sin(0.2 * index)), round(0.95 * height) - down, across, down
 
 
 def _room() -> list[sfm_scene.Rectangle]:
@@ -133,7 +165,11 @@ _MAKERS: dict[str, Callable[[Path], Frames]] = {
     "kitti_00 at 416x128": lambda data: _small(data, "kitti_00_first200"),
     "kitti_06 with a stop": lambda data: _with_stop(data, "kitti_06_first51", 24, 40),
     "kitti_00 with a stop in a turn": lambda data: _with_stop(data, "kitti_00_first200", 106, 40),
-    "kitti_06 behind a truck": lambda data: _behind_a_truck(data, "kitti_06_first51"),
+    "kitti_06 behind a truck": lambda data: _with_a_truck(data, "kitti_06_first51", _ahead),
+    "kitti_06 beside a truck": lambda data: _with_a_truck(data, "kitti_06_first51", _beside),
+    "kitti_06, a truck for a while": lambda data: _with_a_truck(data, "kitti_06_first51", _for_a_while),
+    "kitti_06 nearing a truck": lambda data: _with_a_truck(data, "kitti_06_first51", _nearing),
+    "kitti_00 behind a truck": lambda data: _with_a_truck(data, "kitti_00_first200", _ahead),
     "room, turning almost on the spot": lambda data: _on_the_spot(0.1, 180.0, 60),
     "room, turning on the spot": lambda data: _on_the_spot(0.0, 180.0, 60),
 }

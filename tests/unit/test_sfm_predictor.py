@@ -25,6 +25,7 @@ from vggt_motion.records import FocalHint, SubmapVerdict
 
 CAMERA = Intrinsics.centred(300.0, 480, 180)
 OVER_WIDTH = 300.0 / 480
+Box = tuple[float, float, float, float]  # left, top, right, bottom over width and height
 Scenes = tuple[list[KeyframeImage], list[npt.NDArray[np.float64]], list[npt.NDArray[np.float64]]]
 
 
@@ -344,6 +345,41 @@ def test_the_shipped_excerpt_of_a_straight_street(sample_dir: Path) -> None:
     assert sfm_scene.position_error(centres(prediction), truth) < 0.003
     # 707.1 px of 1226: a straight drive must not claim more than it sees
     assert abs(math.log(prediction.quality.focal_over_width / 0.5768)) < 3.0 * prediction.quality.focal_relative_sigma
+
+
+def with_a_truck(keyframes: list[KeyframeImage], left: float, step: float) -> tuple[list[KeyframeImage], list[Box]]:
+    """Its back over half of each image, from ``left`` on (of the width), moving by ``step`` and swaying."""
+    back = sfm_scene.texture(11, 256)
+    covered, boxes = [], []
+    for k, keyframe in enumerate(keyframes):
+        pixels = keyframe.pixels.copy()
+        height, width = pixels.shape[:2]
+        x = round((left + step * k) * width + 3.0 * np.sin(0.5 * k))
+        across, top, bottom = width // 2 + round(3.0 * np.sin(0.8 * k)), round(0.06 * height), round(0.92 * height)
+        sized = np.asarray(cv2.resize(back, (across, bottom - top)))[..., None]
+        pixels[top:bottom, max(x, 0) : x + across] = sized[:, max(-x, 0) :]
+        covered.append(replace(keyframe, pixels=pixels))
+        boxes.append((max(x, 0) / width, top / height, (x + across) / width, bottom / height))
+    return covered, boxes
+
+
+@pytest.mark.parametrize(
+    ("left", "step"), [(0.25, 0.0), (0.0, 0.0), (0.0, 0.05)], ids=["ahead", "beside", "overtaking"]
+)
+def test_a_truck_over_half_of_the_view_is_not_taken_for_the_scene(sample_dir: Path, left: float, step: float) -> None:
+    """It hardly moves in the image and has most of the texture: to most of the tracks the camera stands."""
+    indices = [0, 1, 2, 4, 5, 7, 9, 11, 13]
+    keyframes, truth = excerpt(sample_dir / "kitti_06_first51", indices)
+    covered, boxes = with_a_truck(keyframes, left, step)
+    prediction = predict(covered)
+    assert prediction.verdict is SubmapVerdict.GOOD, prediction.reason
+    assert len(prediction.frames) == len(indices)
+    assert sfm_scene.position_error(centres(prediction), truth) < 0.005
+    for frame, (x0, y0, x1, y1) in zip(prediction.frames, boxes, strict=True):
+        height, width = frame.confidence.shape
+        own = frame.confidence[round(y0 * height) : round(y1 * height), round(x0 * width) : round(x1 * width)]
+        assert np.mean(own > 0.0) < 0.02, "no depth on what moves"
+        assert np.mean(frame.confidence > 0.0) > 0.05
 
 
 @pytest.mark.data

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -22,6 +22,11 @@ class WorkingImages:
     usable: npt.NDArray[np.bool_]  # (H, W), False on the vehicle and on overlays
     width_px: int
     height_px: int
+    hidden: Mapping[int, npt.NDArray[np.bool_]] = field(default_factory=dict)  # position -> (H, W) of no use there
+
+    def usable_at(self, position: int) -> npt.NDArray[np.bool_]:
+        """Where pixels (H, W) of one image may be used."""
+        return self.usable & ~self.hidden[position] if position in self.hidden else self.usable
 
 
 def fitted_size(width_px: int, height_px: int, max_width_px: int) -> tuple[int, int]:

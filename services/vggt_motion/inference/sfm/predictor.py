@@ -17,8 +17,8 @@ from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics, undistort_rays
 from vggt_motion.inference.given import given_hint
 from vggt_motion.inference.predictor import KeyframeImage, PredictedFrame, Prediction, PredictionHints
+from vggt_motion.inference.sfm import companions, globalmap, images, relocate, rotation, structure, tracks, verdict
 from vggt_motion.inference.sfm import depth as dense
-from vggt_motion.inference.sfm import globalmap, images, relocate, rotation, structure, tracks, verdict
 from vggt_motion.inference.sfm.bundle import Scene
 from vggt_motion.inference.sfm.focal import CameraPrior
 from vggt_motion.inference.sfm.library import load_pycolmap
@@ -39,7 +39,11 @@ _PART_RELATIVE_SIGMA = 0.01  # of the focal length that the whole submap saw, fo
 _COMPANION = "something that moves along fills the view"
 _NO_DEPTH = "the camera did not move enough to see any depth"
 _MAX_VANISHED = 0.35  # share of the image that may lose its points over a step while the camera only turns
-_COMPANION_PX = 3.0
+# What fits of one part of the image over what fits of another: 0.8 to 1.3 where a structure holds for both; 0.2 to 0.7
+# beside a truck that was taken for the scene
+_FITS_AS_WELL = 0.75
+_SURE_SHARE = 0.55  # of the tracks of a step; beside a truck a wrong length of one step can have half of them
+_REST_MOVES_PX = 2.0  # more than any rotation explains
 _MIN_SIDE_PX = 48  # smaller images have no room for windows and pyramids
 
 
@@ -123,37 +127,42 @@ class _Submap:
         focal_px = self._hint.focal_over_width * working.width_px if self._hint is not None else None
         turned = rotation.fit_rotations(matched, originals, focal_px, working.width_px)
         self._seconds["rotation_s"] = time.perf_counter() - started
-        rest: tracks.Tracks | None = None
+        companion = companions.find(followed, originals, working)
+        solved: structure.Structure | None = None
+        doubt = ""
         if turned is not None and turned.residual_px < _STILL_PX:
-            vanished = tracks.vanished_share(followed, originals, working.width_px)
-            if vanished < _MAX_VANISHED:
-                return self._rotation_only(turned, working)
-            # what stays where it is fills the view and moves along, as a truck ahead: look at the rest
-            followed = rest = self._without_companions(turned, originals, working)
-        # 4. structure
-        started = time.perf_counter()
-        first, attempts = structure.solve(followed, originals, working, self._prior())
-        self._attempts.extend(attempts)
-        if first is not None:
-            joined = self._solve_in_parts(first, followed, originals, working)
-            if joined is not None:
-                return replace(joined, stage_seconds=self._seconds | {"parts_s": time.perf_counter() - started})
-        solved, doubt = self._solve(first, originals, working, rest)
+            started = time.perf_counter()
+            if companion is not None:
+                working, solved, doubt = self._beside(companion, turned.focal_px, originals, working)
+            if solved is None:
+                if tracks.vanished_share(followed, originals, working.width_px) < _MAX_VANISHED:
+                    return self._rotation_only(turned, working)
+                return self._failed(f"{_COMPANION}, and beside it no scene was found")
+        else:
+            # 4. structure
+            started = time.perf_counter()
+            first, attempts = structure.solve(followed, originals, working, self._prior())
+            self._attempts.extend(attempts)
+            if companion is not None and first is not None:
+                working, solved, doubt = self._without_companion(companion, first, followed, originals, working)
+            if solved is None:
+                joined = self._solve_in_parts(first, followed, originals, working) if first is not None else None
+                if joined is not None:
+                    return replace(joined, stage_seconds=self._seconds | {"parts_s": time.perf_counter() - started})
+                solved, more = self._solve(first, originals, working)
+                doubt = "; ".join(part for part in (doubt, more) if part)
         self._seconds["structure_s"] = time.perf_counter() - started
         if solved is None:
-            nothing = "structure from motion found no scene that the keyframes agree on"
-            return self._failed(nothing if rest is None else f"{_COMPANION}, and beside it {nothing}")
+            return self._failed("structure from motion found no scene that the keyframes agree on")
         judgement, reason = verdict.judge(solved, len(originals))
         if judgement is SubmapVerdict.FAILED:
-            return self._failed(reason if rest is None else f"{_COMPANION}, and beside it {reason}")
-        if rest is not None:
-            doubt = "; ".join(part for part in (doubt, _COMPANION) if part)
+            return self._failed(reason)
         if doubt:
             judgement, reason = SubmapVerdict.LOW_QUALITY, "; ".join(part for part in (reason, doubt) if part)
         # 5. depth, and the frames in which the camera only turned
         started = time.perf_counter()
         frames = self._frames(solved, working)
-        turned_frames = self._turned_frames(frames, followed, originals, solved, working) if rest is None else []
+        turned_frames = [] if working.hidden else self._turned_frames(frames, followed, originals, solved, working)
         self._seconds["depth_s"] = time.perf_counter() - started
         if turned_frames:
             frames = tuple(sorted((*frames, *turned_frames), key=lambda frame: frame.position))
@@ -161,24 +170,74 @@ class _Submap:
             judgement, reason = SubmapVerdict.LOW_QUALITY, "; ".join(part for part in (reason, doubt) if part)
         return self._prediction(frames, judgement, reason, self._quality(solved, len(frames), working))
 
+    def _without_companion(
+        self,
+        companion: companions.Companion,
+        first: structure.Structure,
+        followed: tracks.Tracks,
+        originals: Sequence[int],
+        working: images.WorkingImages,
+    ) -> tuple[images.WorkingImages, structure.Structure | None, str]:
+        """Whether a structure is that of the scene, where part of the image moves as one piece.
+
+        Returns:
+            the images with what is hidden in them; the structure of the rest, None where the first one stays; and what
+            speaks against whichever it is.
+        """
+        own, rest = first.share_that_fits(followed, companion.points), first.share_that_fits(followed, companion.others)
+        self._attempts.append(f"a part of the image moves as one: {own:.0%} of it fit, {rest:.0%} of the rest")
+        if rest >= _FITS_AS_WELL * own:
+            hides = own < _FITS_AS_WELL * rest
+            return (replace(working, hidden=companion.hidden) if hides else working), None, ""
+        beside, solved, doubt = self._beside(companion, first.scene.focal_px, originals, working)
+        if solved is None:
+            return working, None, f"{_COMPANION}, and beside it no scene was found" if own > rest else ""
+        return beside, solved, doubt
+
+    def _beside(
+        self,
+        companion: companions.Companion,
+        focal_px: float,
+        originals: Sequence[int],
+        working: images.WorkingImages,
+    ) -> tuple[images.WorkingImages, structure.Structure | None, str]:
+        """The images without the companion, and the structure of what is left; None where that is not a scene."""
+        beside = replace(working, hidden=companions.followed_on(companion, originals, working).hidden)
+        # little of the images is left: both ways together have tracks enough to carry the scale
+        followed = tracks.follow(beside, originals).joined(tracks.match(beside, originals, reach=2))
+        matched = _matched(followed, originals, self._assumed_camera(working))
+        turned = rotation.fit_rotations(matched, originals, focal_px, working.width_px)
+        if turned is not None and turned.residual_px < _REST_MOVES_PX:
+            return working, None, ""  # so does the rest: far away, or the camera turned
+        if companions.is_flat(followed, originals):
+            return working, None, ""  # itself an object that passes
+        first, attempts = structure.solve(followed, originals, beside, self._prior())
+        self._attempts.extend(f"beside what moves along, {attempt}" for attempt in attempts)
+        solved, doubt = self._solve(first, originals, beside)
+        if solved is None or verdict.judge(solved, len(originals))[0] is SubmapVerdict.FAILED:
+            return working, None, ""
+        if solved.weakest_share < _SURE_SHARE:
+            doubt = "; ".join(
+                part for part in (doubt, f"{_COMPANION}, and over one step little beside it fits") if part
+            )
+        return beside, solved, doubt
+
     def _solve(
         self,
         solved: structure.Structure | None,
         originals: Sequence[int],
         working: images.WorkingImages,
-        rest: tracks.Tracks | None,
     ) -> tuple[structure.Structure | None, str]:
         """The structure, and what speaks against it beside its own quality.
 
         Where the fast way leaves doubts, matched features are tried as well, grown and mapped all at once: ways that
-        have little in common but the images, so that their agreement means something. ``rest`` are the matches to use,
-        where some are left out.
+        have little in common but the images, so that their agreement means something.
         """
         prior, count = self._prior(), len(originals)
         if solved is not None and verdict.is_convincing(solved, count):
             return solved, ""
         candidates = [solved]
-        matched = rest if rest is not None else tracks.match(working, originals)
+        matched = tracks.match(working, originals)
         again, attempts = structure.solve(matched, originals, working, prior)
         self._attempts.extend(f"matched features, {attempt}" for attempt in attempts)
         candidates.append(again)
@@ -258,16 +317,6 @@ class _Submap:
         reason = "the camera turned on the spot: the scale after it is carried over, not measured"
         return self._prediction(everywhere, SubmapVerdict.LOW_QUALITY, reason, quality)
 
-    def _without_companions(
-        self, turned: rotation.RotationFit, originals: Sequence[int], working: images.WorkingImages
-    ) -> tracks.Tracks:
-        """Matched features without those that a rotation explains."""
-        matched = tracks.match(working, originals)
-        camera = replace(self._assumed_camera(working), fx=turned.focal_px, fy=turned.focal_px)
-        companions = rotation.explained(matched, turned, camera, _COMPANION_PX)
-        self._attempts.append(f"what a rotation explains left out: {companions.mean():.0%} of the matched features")
-        return matched.without(companions)
-
     def predict_turning(self) -> Prediction:
         """The prediction for a camera that is known to have turned on the spot."""
         working = self._working()
@@ -336,6 +385,7 @@ class _Submap:
         usable = images.usable_pixels(self._hints.ego_mask, width, height)
         sparse = _sparse(solved)
         maps = dense.dense_depth(grey, poses, sparse, intrinsics, usable)
+        maps.update({p: _without_hidden(maps[p], working.hidden[p]) for p in registered if p in working.hidden})
         loops = [p for p in sorted(self._hints.loop_positions) if p not in self._hints.zero_motion_copies]
         if loops:
             located = relocate.locate(working, loops, poses, maps, _intrinsics(solved.scene, working), solved.scene)
@@ -477,6 +527,14 @@ def _matched(followed: tracks.Tracks, positions: Sequence[int], camera: Intrinsi
             _, at_a, at_b = followed.between(a, b)
             matched[a, b] = (straight(at_a), straight(at_b))
     return matched
+
+
+def _without_hidden(found: dense.DepthMap, hidden: npt.NDArray[np.bool_]) -> dense.DepthMap:
+    """No depth where something hides the scene."""
+    height, width = found.depth.shape
+    share = cv2.resize(hidden.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    seen = np.asarray(share <= 0.0, dtype=np.float32)
+    return dense.DepthMap(found.depth * seen, found.confidence * seen)
 
 
 def _intrinsics(scene: Scene, working: images.WorkingImages) -> Intrinsics:

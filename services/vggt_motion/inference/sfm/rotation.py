@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.geometry.projection import Intrinsics
 from vggt_motion.geometry.se3 import nearest_rotation
-from vggt_motion.inference.sfm.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
 Pair = tuple[int, int]
@@ -125,21 +123,6 @@ def extend(
             turn[:3, :3] = b_from_a if before < position else b_from_a.T
             known[position] = turn @ known[before]
     return {position: pose for position, pose in known.items() if position not in camera_from_submap}
-
-
-def explained(tracks: Tracks, turned: RotationFit, camera: Intrinsics, within_px: float) -> npt.NDArray[np.bool_]:
-    """Points (count,) whose first and last sight differ by the rotation alone."""
-    if tracks.count == 0:
-        return np.zeros(0, dtype=np.bool_)
-    middle = np.array([camera.cx, camera.cy])
-    first = np.searchsorted(tracks.point, np.arange(tracks.count), side="left")
-    last = np.searchsorted(tracks.point, np.arange(tracks.count), side="right") - 1
-    rotations = np.stack([turned.camera_from_submap[int(frame)] for frame in tracks.frame])
-    last_from_first = np.einsum("kab,kcb->kac", rotations[last], rotations[first])
-    rays = np.einsum("kab,kb->ka", last_from_first, _rays(tracks.pixel[first] - middle, camera.fx))
-    depth = np.maximum(rays[:, 2:], 1e-3)
-    errors = np.linalg.norm(rays[:, :2] / depth * camera.fx - (tracks.pixel[last] - middle), axis=1)
-    return np.asarray(errors < within_px)
 
 
 @dataclass(frozen=True)

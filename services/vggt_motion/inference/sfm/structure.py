@@ -71,6 +71,15 @@ class Structure:
             poses[self.positions[index]] = pose
         return poses
 
+    def share_that_fits(self, tracks: Tracks, points: npt.NDArray[np.bool_]) -> float:
+        """Share of the observations of some points (count,) of the tracks it was solved from that fit.
+
+        Only points that three frames see count: two agree with anything along their epipolar line.
+        """
+        often = points & (np.bincount(tracks.point, minlength=tracks.count) >= 3)
+        seen = int(np.count_nonzero(often[tracks.point]))
+        return int(np.count_nonzero(often[self.observations.point])) / seen if seen else 0.0
+
 
 def solve(
     tracks: Tracks, positions: Sequence[int], working: WorkingImages, prior: CameraPrior

@@ -60,11 +60,14 @@ class Tracks:
         shared, at_a, at_b = np.intersect1d(self.point[in_a], self.point[in_b], assume_unique=True, return_indices=True)
         return shared, self.pixel[in_a[at_a]], self.pixel[in_b[at_b]]
 
-    def without(self, points: npt.NDArray[np.bool_]) -> Tracks:
-        """The tracks but for some points (count,)."""
-        number = np.cumsum(~points) - 1
-        kept = ~points[self.point]
-        return Tracks(number[self.point[kept]], self.frame[kept], self.pixel[kept], int((~points).sum()))
+    def joined(self, other: Tracks) -> Tracks:
+        """These and others, which are taken for other points; what got lost is not carried over."""
+        return Tracks(
+            np.concatenate([self.point, self.count + other.point]),
+            np.concatenate([self.frame, other.frame]),
+            np.concatenate([self.pixel, other.pixel]),
+            self.count + other.count,
+        )
 
 
 def vanished_share(tracks: Tracks, positions: Sequence[int], width_px: int) -> float:
@@ -103,9 +106,10 @@ class _Memory:
     def recall(
         self, find: Callable[[], Tracks], working: WorkingImages, positions: Sequence[int], *how: object
     ) -> Tracks:
-        digest = hashlib.blake2b(working.usable.tobytes())
+        digest = hashlib.blake2b()
         for position in positions:
             digest.update(working.grey[position].tobytes())
+            digest.update(working.usable_at(position).tobytes())
         key = (*how, working.width_px, working.height_px, tuple(positions), digest.digest())
         with self._lock:
             known = self._found.pop(key, None)
@@ -134,7 +138,7 @@ def _follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
     lost: list[tuple[int, Points]] = []
     flows = _flows(working, positions)
     for (a, b), flow in zip(itertools.pairwise(positions), flows, strict=True):
-        fresh = _corners(working.grey[a], working.usable, pixels)
+        fresh = _corners(working.grey[a], working.usable_at(a), pixels)
         ids = np.concatenate([ids, np.arange(next_id, next_id + len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         rows.append((ids[len(ids) - len(fresh) :], a, fresh))
@@ -143,7 +147,7 @@ def _follow(working: WorkingImages, positions: Sequence[int]) -> Tracks:
         inside = np.all((moved >= _BORDER_PX) & (moved <= np.array([width, height]) - 1 - _BORDER_PX), axis=1)
         kept &= inside
         nearest = np.rint(np.where(inside[:, None], moved, 0.0)).astype(np.int64)
-        kept &= working.usable[nearest[:, 1], nearest[:, 0]]
+        kept &= working.usable_at(b)[nearest[:, 1], nearest[:, 0]]
         followed, landed = ids[kept], moved[kept]
         lost.append((a, pixels[~kept]))
         rows.append((followed, b, landed))
@@ -179,7 +183,9 @@ def match(working: WorkingImages, positions: Sequence[int], reach: int = 4) -> T
 
 
 def _match(working: WorkingImages, positions: Sequence[int], reach: int) -> Tracks:
-    found = parallel.each(lambda position: features.detect(working.grey[position], working.usable), positions)
+    found = parallel.each(
+        lambda position: features.detect(working.grey[position], working.usable_at(position)), positions
+    )
     detected = dict(zip(positions, found, strict=True))
     offset = dict(zip(positions, np.cumsum([0, *(len(detected[p].points) for p in positions)]), strict=False))
     total = sum(len(found.points) for found in detected.values())
@@ -229,8 +235,8 @@ def _rejoin(
         ids (M,) of the matches, lost ones first taken up again, the rest numbered from ``next_id``; where the new ones
         are in ``a``; where all are in ``b``.
     """
-    features_a = features.detect(working.grey[a], working.usable)
-    features_b = features.detect(working.grey[b], working.usable)
+    features_a = features.detect(working.grey[a], working.usable_at(a))
+    features_b = features.detect(working.grey[b], working.usable_at(b))
     rows = features.match(features_a, features_b)
     at_a, at_b = features_a.points[rows[:, 0]], features_b.points[rows[:, 1]]
     ids = np.full(len(rows), -1, dtype=np.int64)
