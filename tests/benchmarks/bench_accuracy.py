@@ -6,7 +6,7 @@ A sequence is a path, a name below the evaluation data, or a name of ``derived_s
 images, stops, turns on the spot. Without any, all of them, and those of KITTI once more with the camera given.
 
 Prints, per sequence: frames, keyframes, submaps and how the predictor judged them, refused constraints, breaks, ATE of
-all frames after Sim(3) alignment, drift, and seconds of video against seconds of computing on one core.
+all frames after Sim(3) alignment, drift, and seconds of video against seconds of computing with one worker.
 """
 
 from __future__ import annotations

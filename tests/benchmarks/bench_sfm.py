@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_sfm.py [SEQUENCE ...] [--no-colmap] [--no-depth]
 
 Three tables: every submap of the sequences with ground truth (error of the keyframes' positions after Sim(3) alignment
-as a share of the path, error of the rotation from first to last, focal length, seconds per stage on one core); the same
+as a share of the path, error of the rotation from first to last, focal length, seconds per stage); the same
 keyframes at the same size by SIFT, sequential matching and pycolmap's incremental mapping on one thread; and the
 relative error of depth against confidence, by the depth camera of 7-Scenes, whose place beside the colour camera is
 fitted on keyframes that the table leaves out.
