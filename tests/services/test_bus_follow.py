@@ -11,9 +11,10 @@ import pytest
 from bus_processes import Process, connect, entry, free_port, running, wait_until
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.follow import Followed, Follower
+from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus
 from vggt_motion.errors import LedgerError
-from vggt_motion.records import Event, LogEntry
+from vggt_motion.records import Event, LedgerStatus, LogEntry, Stream, StreamPosition
 
 
 def take(follower: Follower[Event], count: int, timeout_s: float = 40.0) -> list[int]:
@@ -152,3 +153,38 @@ def test_closing_ends_a_waiting_call(endpoint: str, bus: Bus) -> None:
     follower.close()
     waiting.join(10)
     assert outcome == [None]
+
+
+def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: Bus) -> None:
+    entries = [entry(number) for number in range(3)]
+    statuses: list[LedgerStatus | None] = []
+
+    def status(_: str, __: bytes) -> bytes:
+        positions = (StreamPosition("event", len(entries)),)
+        return codec.encode(LedgerStatus(positions, (), 0, 1, True, "", 0, "f00d"))
+
+    def read(_: str, payload: bytes) -> bytes:
+        request = codec.decode(calls.ReadRequest, payload)
+        held = entries[request.from_sequence :] if request.stream == "event" else []
+        return codec.encode(calls.ReadReply(tuple(held), len(entries) if request.stream == "event" else 0))
+
+    with connect(endpoint) as ledger:
+        ledger.serve(ledger.keys.rpc("ledger", "status"), status)
+        ledger.serve(ledger.keys.rpc("ledger", "read"), read)
+        log = LogFollower(bus, {Stream.EVENT: 1}, on_status=statuses.append, interval_s=0.1)
+        taken: list[str] = []
+
+        def has(*numbers: int) -> bool:
+            log.wait(0.5)
+            taken.extend(record.event_id for record in log.poll() if isinstance(record, Event))
+            return taken == [f"event-{number}" for number in numbers]
+
+        wait_until(lambda: has(1, 2))
+        entries.append(entry(3))  # never published
+        wait_until(lambda: has(1, 2, 3))
+        entries.append(entry(4))
+        ledger.publisher(ledger.keys.log("event"), blocking=True).put(codec.encode(entries[4]))
+        wait_until(lambda: has(1, 2, 3, 4))
+        assert log.positions()[Stream.EVENT] == 5
+        assert any(answer is not None and answer.position("event") == 4 for answer in statuses)
+        log.close()

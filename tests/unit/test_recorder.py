@@ -30,6 +30,7 @@ from vggt_motion.geometry import se3
 from vggt_motion.recorder import schemas
 from vggt_motion.recorder.container import McapScanner
 from vggt_motion.recorder.indexset import IndexSet
+from vggt_motion.recorder.payloads import RecentPayloads
 from vggt_motion.recorder.record import FrameId, Recording, image_topic
 from vggt_motion.records import BlobRef, LogEntry
 from vggt_motion.sources.mcap import McapSource
@@ -443,3 +444,16 @@ def test_what_was_flushed_survives_the_process(tmp_path: Path) -> None:
     assert isinstance(error, SourceTruncatedError)
     recording.close()
     assert len(collect(path)[0]) == 6
+
+
+def test_recent_payloads_are_bounded_by_their_bytes_and_forget_what_was_not_asked_for() -> None:
+    held = RecentPayloads(10)
+    held.put("a", b"1234")
+    held.put("b", b"1234")
+    held.put("a", b"12")  # another length in its place
+    held.put("c", b"1234")
+    assert [held.get(key) for key in "abc"] == [b"12", b"1234", b"1234"]
+    held.put("d", b"1")
+    assert [held.get(key) for key in "abcd"] == [None, b"1234", b"1234", b"1"]
+    held.put("e", bytes(11))  # more than all of it
+    assert [held.get(key) for key in "abcde"] == [None] * 5
