@@ -76,7 +76,7 @@ def decode_image(payload: bytes) -> tuple[bytes, str, int]:
         raise CodecError("not a foxglove.CompressedImage") from error
     media_type = _MEDIA_TYPE_OF_FORMAT.get(message.format.lower())
     if media_type is None:
-        raise CodecError(f"image format '{message.format[:20]}' is not read, only jpeg and png are")
+        raise CodecError(f"image format {message.format[:20]!r} is not read, only jpeg and png are")
     if not 0 <= message.timestamp.nanos < _NANOSECONDS:
         raise CodecError(f"image timestamp has {message.timestamp.nanos} nanoseconds")
     time_ns = message.timestamp.seconds * _NANOSECONDS + message.timestamp.nanos

@@ -54,6 +54,7 @@ def test_hostile_bytes_end_as_one_line(payload: bytes, attachment: bytes) -> Non
     [
         (CompressedImage(data=b"x", format="webp"), "format 'webp' is not read"),
         (CompressedImage(data=b"x"), "format '' is not read"),
+        (CompressedImage(data=b"x", format="a\nb"), r"format 'a\\nb' is not read"),
         (CompressedImage(format="png"), "without image bytes"),
         (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=-1)), "out of range"),
         (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=2**40)), "out of range"),

@@ -240,7 +240,7 @@ class McapScanner:
         schema = self._schemas.get(channel.schema_id)
         if schema is None and channel.schema_id != 0:
             raise _DamageError(
-                f"channel {channel.topic} names schema {channel.schema_id}, which the file does not define"
+                f"channel {channel.topic!r} names schema {channel.schema_id}, which the file does not define"
             )
         self._channels[channel.id] = StoredChannel(
             channel.topic,

@@ -129,7 +129,8 @@ class McapSource:
 
     def _nothing_found(self) -> str:
         damage = f"; the file is broken off: {self._scanner.damage}" if self._scanner.damage else ""
-        topics = ", ".join(sorted(self._topics)[:8]) or "none"
+        # escaped as in a literal: what stands in a file must not break the line
+        topics = ", ".join(repr(topic)[1:-1] for topic in sorted(self._topics)[:8]) or "none"
         return f"{self._scanner.path} has no {schemas.IMAGE} messages (topics: {topics}){damage}"
 
 
