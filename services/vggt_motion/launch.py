@@ -38,7 +38,7 @@ _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
 _REST_TIMEOUT_S = 5.0
 _RECORDER_QUIET_S = 2.0  # no frame for so long: those that are missing went by while no recorder was there
-_LOG_PATIENCE_S = 5.0  # what the frontend appended last is seen here after this at the latest
+_LOG_PATIENCE_S = 10.0  # what the frontend appended last is seen here after this at the latest
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
 LOG_FOLDER = "logs"
@@ -302,6 +302,7 @@ class LocalRun:
         next_status = 0.0
         finished_at: float | None = None
         absent_since: float | None = None
+        ends: Mapping[str, int] | None = None
         try:
             while not self._interrupts:
                 supervisor.poll()
@@ -319,9 +320,13 @@ class LocalRun:
                 graph = state.latest_graph()
                 if graph is not None and graph.is_final and supervisor.exit_code("frontend") is not None:
                     finished_at = finished_at or now
-                    if recorded.is_complete(state, follower.positions(), now):
+                    # The streams are not ordered mutually, and a publication may be lost: what the graph speaks of
+                    # need not be here yet.
+                    ends = ends or _ends_of(LedgerClient(bus))
+                    has_all = ends is not None and _has_come(follower, ends)
+                    if has_all and recorded.is_complete(state, follower.positions(), now):
                         break
-                    if now - finished_at > _RECORDER_TIMEOUT_S:
+                    if has_all and now - finished_at > _RECORDER_TIMEOUT_S:
                         _log.warning("the recorder did not catch up in time; the recording may lack its end")
                         break
                 follower.wait(_SUPERVISE_S)
@@ -419,14 +424,26 @@ class _RecorderProgress:
 def _take_in_rest(follower: LogFollower, state: LogState, ledger: LedgerClient) -> None:
     """Fold what the ledger has acknowledged up to now, so that an interrupted run shows all that was done."""
     end = time.monotonic() + _REST_TIMEOUT_S
-    try:
-        wanted = {entry.stream: entry.next_sequence for entry in ledger.status().positions}
-    except BusError as error:
-        _log.warning("the ledger did not answer any more; its last records may be missing: %s", error)
+    ends = _ends_of(ledger)
+    if ends is None:
+        _log.warning("the ledger did not answer any more; its last records may be missing")
         return
     while time.monotonic() < end:
         for record in follower.poll():
             state.apply(record)
-        if all(wanted.get(stream.value, 0) <= position for stream, position in follower.positions().items()):
+        if _has_come(follower, ends):
             return
         time.sleep(_TICK_S)
+
+
+def _ends_of(ledger: LedgerClient) -> Mapping[str, int] | None:
+    """Next sequence number of every stream that has records; None: the ledger does not answer."""
+    try:
+        return {entry.stream: entry.next_sequence for entry in ledger.status().positions}
+    except BusError:
+        return None
+
+
+def _has_come(follower: LogFollower, ends: Mapping[str, int]) -> bool:
+    """Whether every stream was taken in up to there."""
+    return all(ends.get(stream.value, 0) <= position for stream, position in follower.positions().items())

@@ -28,7 +28,8 @@ def session(tmp_path: Path) -> Session:
     for submap in made.submaps:
         blobs = [made.blobs[ref.sha256] for ref in codec.blob_refs(submap)]
         request = append_request(Stream.SUBMAP, submap.record_id, submap, blobs)
-        desk.append(codec.encode(request))
+        (outcome,) = desk.append([codec.encode(request)])
+        assert isinstance(outcome, bytes), outcome
     ledger.close()
     return made
 
