@@ -21,6 +21,7 @@ from vggt_motion.sources.timing import NANOSECONDS
 
 _log = logging.getLogger(__name__)
 _HISTORY = 64  # frames that a receiver which joins late still gets
+_SETTLE_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,8 @@ def replay(
             encoding="application/protobuf;foxglove.CompressedImage",
         )
         try:
+            # Before Zenoh has told us of the receivers that are there, it drops what is published.
+            stopping.wait(_SETTLE_S)
             pace = _Pace(rate, stopping)
             frames = _Laps(source, start_s, duration_s, loop=loop)
             count = 0
@@ -96,6 +99,8 @@ def replay(
                     attachment=ImageHeader(0, frame.index, is_last, is_accepted=False).encode(),
                 )
                 count += 1
+            # What a receiver missed it asks us for, as long as we are there.
+            stopping.wait(_SETTLE_S)
         finally:
             publisher.close()
     finally:
