@@ -328,8 +328,8 @@ class Watched:
         with contextlib.suppress(psutil.NoSuchProcess):
             for process in [self._run, *self._run.children(recursive=True)]:
                 with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):
-                    if process.pid not in self._names:
-                        self._names[process.pid] = self._name_of(process)
+                    # each time: between fork and exec a child has its parent's command line
+                    self._names[process.pid] = self._name_of(process)
                     times = process.cpu_times()
                     self.used[process.pid] = times.user + times.system
 
