@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
-import sqlite3
 from pathlib import Path
 from typing import Any
 
 from vggt_motion.ledger.directory import Ledger
 from vggt_motion.ledger.jobs import JobPolicy
+from vggt_motion.ledger.sqlite import read_only
 from vggt_motion.ledger.store import NewRecord
 from vggt_motion.records import Job, JobKind, JobReport
 
@@ -19,21 +18,24 @@ RESULT_STREAMS = {"describe": "descriptor", "predict": "submap", "register": "co
 
 def damage_blob(directory: Path, sha256: str, content: bytes) -> None:
     """Put other bytes in the place of a blob, wherever the ledger keeps it; nobody may serve the session."""
-    with contextlib.closing(sqlite3.connect(directory / "ledger.db")) as connection:
-        changed = connection.execute("UPDATE contents SET content = ? WHERE sha256 = ?", (content, sha256)).rowcount
-        connection.commit()
+    with read_only(directory / "ledger.db") as reader:
+        place = reader.find_place(sha256)
     path = directory / "blobs" / sha256
-    if path.is_file():
+    assert path.is_file() == (place is None), sha256
+    if place is None:
         path.write_bytes(content)
-        changed += 1
-    assert changed == 1, sha256
+        return
+    with (directory / "blobs" / "packs" / f"{place.pack:08d}.pack").open("r+b") as file:
+        file.seek(place.offset_bytes)
+        file.write(content.ljust(place.size_bytes, b"\0")[: place.size_bytes])
 
 
 def stored_blobs(directory: Path) -> set[str]:
-    """SHA-256 of every blob that is kept, whether a record refers to it or not."""
-    with contextlib.closing(sqlite3.connect(f"{(directory / 'ledger.db').as_uri()}?mode=ro", uri=True)) as connection:
-        names = {str(row[0]) for row in connection.execute("SELECT sha256 FROM contents")}
-    return names | {path.name for path in (directory / "blobs").rglob("*") if path.is_file()}
+    """Every blob that is kept, whether a record refers to it or not: SHA-256, and how long each pack is."""
+    with read_only(directory / "ledger.db") as reader:
+        names = {entry.sha256 for entry, _ in reader.blobs()}
+    paths = [path for path in (directory / "blobs").rglob("*") if path.is_file()]
+    return names | {f"{path.name} {path.stat().st_size}" for path in paths}
 
 
 class Clock:
@@ -68,7 +70,7 @@ def open_ledger(directory: Path, clock: Clock | None = None, **options: Any) -> 
     counter = itertools.count()
     options.setdefault("new_lease_id", lambda: f"lease{next(counter)}")
     options.setdefault("policy", JobPolicy())
-    options.setdefault("inline_blob_bytes", 0)  # blobs are files unless a test is about those that are not
+    options.setdefault("packed_blob_bytes", 0)  # blobs are files unless a test is about those that are not
     return Ledger(
         directory,
         input_streams={"keyframe"},

@@ -151,9 +151,9 @@ class DiskLog:
         self._hook_files()
 
     def _hook_files(self) -> None:
-        from vggt_motion.ledger import blobs
+        from vggt_motion.ledger import files
 
-        log, real = self, blobs.FileOperations
+        log, real = self, files.FileOperations
 
         class Logged(real):  # type: ignore[misc, valid-type]
             def write_and_sync(self, path: Path, data: bytes) -> None:
@@ -162,6 +162,19 @@ class DiskLog:
                     log.add(Operation("write", name, 0, data))
                 begun = log.begin_sync()
                 super().write_and_sync(path, data)
+                if name is not None:
+                    log.add(Operation("sync", name, begun))
+
+            def write_at(self, path: Path, descriptor: int, offset_bytes: int, pieces: Sequence[bytes]) -> None:
+                name = log.relative(str(path))
+                if name is not None:
+                    log.add(Operation("write", name, offset_bytes, b"".join(pieces)))
+                super().write_at(path, descriptor, offset_bytes, pieces)
+
+            def sync_data(self, path: Path, descriptor: int) -> None:
+                name = log.relative(str(path))
+                begun = log.begin_sync()
+                super().sync_data(path, descriptor)
                 if name is not None:
                     log.add(Operation("sync", name, begun))
 
@@ -178,7 +191,7 @@ class DiskLog:
                 if name is not None:
                     log.add(Operation("sync_folder", _folder_of(name), begun))
 
-        blobs.FileOperations = Logged  # type: ignore[misc]
+        files.FileOperations = Logged  # type: ignore[misc]
         for module in list(sys.modules.values()):
             if getattr(module, "FileOperations", None) is real:
                 module.FileOperations = Logged  # type: ignore[attr-defined]
@@ -415,7 +428,7 @@ def workload(folder: Path, log: DiskLog, *, syncs: bool) -> None:
     from vggt_motion.records import JobKind
 
     generator = random.Random(1)
-    ledger = open_ledger(folder, inline_blob_bytes=3000)
+    ledger = open_ledger(folder, packed_blob_bytes=3000)
     for statement in ("PRAGMA wal_autocheckpoint = 12", *(() if syncs else ("PRAGMA synchronous = OFF",))):
         ledger.rows._writer.execute(statement)
     ledger.rows.read(lambda reader: reader.positions())

@@ -20,7 +20,7 @@ from vggt_motion.bus.images import encode_image
 from vggt_motion.config import FrontendConfig
 from vggt_motion.errors import BusError
 from vggt_motion.frontend.pipeline import FrontendPipeline, KeyframeOutput
-from vggt_motion.ledger.blobs import free_space
+from vggt_motion.ledger.files import free_space
 from vggt_motion.records import Event, EventKind, Keyframe, Stream
 from vggt_motion.sources.registry import open_source
 from vggt_motion.sources.source import Frame

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vggt_motion.errors import DiskFullError, LedgerError, RequestRefusedError
-from vggt_motion.ledger.blobs import BlobFiles, FileOperations
+from vggt_motion.ledger.blobs import BlobFiles
+from vggt_motion.ledger.files import FileOperations
 from vggt_motion.ledger.store import BlobEntry, DamagedBlobError, InvalidRequestError, UnknownError
 
 

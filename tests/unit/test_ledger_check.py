@@ -120,12 +120,12 @@ def test_a_damaged_blob_is_named_set_aside_and_healed_by_appending_again(session
 
 def test_a_damaged_small_blob_is_named_set_aside_and_healed_by_appending_again(tmp_path: Path) -> None:
     session = tmp_path / "session"
-    ledger = open_ledger(session, inline_blob_bytes=100)
+    ledger = open_ledger(session, packed_blob_bytes=100)
     ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")])
     ledger.close()
     report = check(session)
     assert report.is_sound and report.blob_count == 1
-    assert report.stored_bytes == (session / "ledger.db").stat().st_size
+    assert report.stored_bytes == (session / "ledger.db").stat().st_size + len(b"image")
     damage_blob(session, entry(b"image").sha256, b"imagE")
     assert not check(session, repair=False).is_sound
     with pytest.raises(LedgerError, match="damaged"):
@@ -134,7 +134,7 @@ def test_a_damaged_small_blob_is_named_set_aside_and_healed_by_appending_again(t
     assert problem.startswith(f"keyframe/0 ('k0'): blob {entry(b'image').sha256} is damaged")
     (problem,) = check(session).problems
     assert "is missing" in problem
-    ledger = open_ledger(session, inline_blob_bytes=100)
+    ledger = open_ledger(session, packed_blob_bytes=100)
     assert ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")]).was_known
     ledger.close()
     assert check(session).is_sound
@@ -281,7 +281,7 @@ def test_a_session_in_use_is_not_removed(session: Path) -> None:
 
 
 def test_a_session_comes_out_of_an_archive_as_it_went_in(session: Path, tmp_path: Path) -> None:
-    ledger = open_ledger(session, inline_blob_bytes=100)  # exporting needs no lock
+    ledger = open_ledger(session, packed_blob_bytes=100)  # exporting needs no lock
     ledger.store.append(record("event", "e0"), [b"small"], [entry(b"small")])
     report = export_session(session, tmp_path / "session.tar")
     ledger.store.append(record("keyframe", "k2"))

@@ -14,12 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ledger_helpers import open_ledger, record
+from ledger_helpers import damage_blob, open_ledger, record
 from vggt_motion.errors import DiskFullError, LedgerError, RefusalCode, RequestRefusedError
 from vggt_motion.ledger import log, schema, sqlite
 from vggt_motion.ledger.blobs import BlobFiles
 from vggt_motion.ledger.check import check
 from vggt_motion.ledger.directory import Ledger, stored_blob
+from vggt_motion.ledger.export import export_session, import_session
 from vggt_motion.ledger.log import Append, Appended, is_intact
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
 from vggt_motion.ledger.store import (
@@ -261,16 +262,17 @@ def test_a_stored_row_that_changed_is_not_intact(ledger: Ledger) -> None:
         assert not is_intact(type(row)(**{**row.__dict__, **change}))
 
 
-# Small blobs among the rows
+# Small blobs in packs
 
 
-def test_small_blobs_stand_among_the_rows_and_large_ones_are_files(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=5)
+def test_small_blobs_lie_in_packs_and_large_ones_are_files(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=5)
     small, large = b"small", b"larger"
     ledger.store.append(record("keyframe", "a"), [small, large], [entry(small), entry(large)])
     ledger.store.append(record("keyframe", "b"), [], [entry(small), entry(large)])
     assert [path.name for path in (tmp_path / "session" / "blobs").glob("*[0-9a-f]")] == [entry(large).sha256]
-    assert ledger.store.sizes().blob_bytes == len(large)
+    assert ledger.store.sizes().blob_bytes == len(small) + len(large)
+    assert (tmp_path / "session" / "blobs" / "packs" / "00000001.pack").read_bytes() == small
     ledger.close()
     again = open_ledger(tmp_path / "session")
     assert [again.store.blob(entry(data).sha256) for data in (small, large)] == [small, large]
@@ -280,8 +282,8 @@ def test_small_blobs_stand_among_the_rows_and_large_ones_are_files(tmp_path: Pat
         stored_blob(tmp_path / "session", entry(b"nothing").sha256)
 
 
-def test_a_small_blob_and_its_record_share_one_commit(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+def test_small_blobs_of_many_threads_share_one_commit(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
     gate = Gate(ledger.rows, waiting=15)
     in_threads(
         16,
@@ -292,7 +294,7 @@ def test_a_small_blob_and_its_record_share_one_commit(tmp_path: Path) -> None:
 
 
 def test_of_several_at_a_time_each_stands_for_itself_in_one_commit(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=3)
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=3)
     ledger.store.append(record("keyframe", "first"))
     gate = Gate(ledger.rows, waiting=0)
     conflicting = dataclasses.replace(record("keyframe", "first"), identity_sha256=bytes(32))
@@ -331,7 +333,7 @@ def test_when_the_commit_fails_nobody_in_it_is_acknowledged(ledger: Ledger) -> N
 
 
 def test_a_refused_record_leaves_no_content_behind(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
     ledger.store.append(record("keyframe", "a"))
     with pytest.raises(ConflictError):
         ledger.rows.write(
@@ -342,12 +344,23 @@ def test_a_refused_record_leaves_no_content_behind(tmp_path: Path) -> None:
     with pytest.raises(UnknownError):
         ledger.store.blob(entry(b"new").sha256)
     ledger.close()
+    report = check(tmp_path / "session")
+    assert report.repaired == ("3 bytes of writes that were never acknowledged removed from pack 1",)
+    assert check(tmp_path / "session").repaired == ()
+
+
+def test_a_small_blob_that_is_known_is_not_stored_again(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
+    for name in ("a", "b", "a"):
+        ledger.store.append(record("keyframe", name), [b"image"], [entry(b"image")])
+    assert (tmp_path / "session" / "blobs" / "packs" / "00000001.pack").read_bytes() == b"image"
+    ledger.close()
 
 
 def test_a_damaged_small_blob_is_noticed_set_aside_and_healed_by_appending_again(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", inline_blob_bytes=100)
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
     ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image")])
-    ledger.rows.write(lambda transaction: transaction.set_content(entry(b"image").sha256, b"imagE"))
+    damage_blob(tmp_path / "session", entry(b"image").sha256, b"imagE")
     with pytest.raises(DamagedBlobError):
         ledger.store.blob(entry(b"image").sha256)
     assert (tmp_path / "session" / "blobs" / "damaged" / entry(b"image").sha256).read_bytes() == b"imagE"
@@ -490,7 +503,7 @@ def test_an_older_schema_is_brought_up_to_date(tmp_path: Path, monkeypatch: pyte
 def test_a_session_with_all_blobs_in_files_is_brought_up_to_date_by_looking_at_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Schema 2 knew no small blobs among the rows."""
+    """Schema 2 knew only blobs in files of their own."""
     folder = tmp_path / "session"
     files = BlobFiles(folder / "blobs")
     (stored,) = files.put([b"image"], keep_free_bytes=0)
@@ -501,13 +514,53 @@ def test_a_session_with_all_blobs_in_files_is_brought_up_to_date_by_looking_at_i
         with contextlib.closing(sqlite3.connect(folder / "ledger.db")) as connection, connection:
             connection.execute("INSERT INTO blobs VALUES (?, ?)", (stored.sha256, stored.size_bytes))
     with read_only(folder / "ledger.db") as reader:
-        assert reader.file_blob_bytes() == stored.size_bytes
-        assert list(reader.file_blobs()) == [stored]
-    ledger = open_ledger(folder, inline_blob_bytes=100)
+        assert reader.blob_bytes() == stored.size_bytes
+        assert list(reader.blobs()) == [(stored, None)]
+    ledger = open_ledger(folder, packed_blob_bytes=100)
     ledger.store.append(record("keyframe", "a"), [], [stored])
     assert ledger.store.blob(stored.sha256) == b"image"
     ledger.close()
     assert check(folder).is_sound
+
+
+def test_small_blobs_among_the_rows_stay_there_and_heal_into_a_pack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Schema 3 kept small blobs in a table."""
+    folder = tmp_path / "session"
+    folder.mkdir()
+    contents = {entry(data).sha256: data for data in (b"image", b"depth")}
+    with monkeypatch.context() as old:
+        old.setattr(sqlite, "MIGRATIONS", schema.MIGRATIONS[:3])
+        old.setattr(sqlite, "SCHEMA_VERSION", 3)
+        SqliteRows(folder / "ledger.db").close()
+        with contextlib.closing(sqlite3.connect(folder / "ledger.db")) as connection, connection:
+            for sha256, data in contents.items():
+                connection.execute("INSERT INTO blobs VALUES (?, ?, 0)", (sha256, len(data)))
+                connection.execute("INSERT INTO contents VALUES (?, ?)", (sha256, data))
+    with read_only(folder / "ledger.db") as reader:
+        assert (reader.blob_bytes(), list(reader.blobs())) == (0, [])
+    assert [stored_blob(folder, sha256) for sha256 in contents] == list(contents.values())
+    ledger = open_ledger(folder, packed_blob_bytes=100)
+    ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image"), entry(b"depth")])
+    assert [ledger.store.blob(sha256) for sha256 in contents] == list(contents.values())
+    assert ledger.store.place(entry(b"image").sha256) is None
+    ledger.close()
+    assert check(folder).is_sound
+    with contextlib.closing(sqlite3.connect(folder / "ledger.db")) as connection, connection:
+        connection.execute("UPDATE contents SET content = ? WHERE sha256 = ?", (b"imagE", entry(b"image").sha256))
+    (problem,) = check(folder).problems
+    assert problem.startswith(f"keyframe/0 ('a'): blob {entry(b'image').sha256} is damaged")
+    ledger = open_ledger(folder, packed_blob_bytes=100)
+    assert ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image")]).was_known
+    assert ledger.store.blob(entry(b"image").sha256) == b"image"
+    assert ledger.store.place(entry(b"image").sha256) == (folder / "blobs" / "packs" / "00000001.pack", 0, 5)
+    ledger.close()
+    assert check(folder).is_sound
+    export_session(folder, tmp_path / "session.tar")
+    import_session(tmp_path / "session.tar", tmp_path / "copy")
+    assert check(tmp_path / "copy").is_sound
+    assert [stored_blob(tmp_path / "copy", sha256) for sha256 in contents] == list(contents.values())
 
 
 def test_a_newer_schema_is_refused_and_not_touched(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Large blobs as files named by their content: ``blobs/abcdef...``. Small ones stand among the rows (:mod:`.log`).
+"""Large blobs as files named by their content: ``blobs/abcdef...``. Small ones stand in packs (:mod:`.packs`).
 
 A blob is written under ``blobs/incoming``, forced to the disk, renamed to its name and its folder forced to the disk;
 only then does a row refer to it. So a name under ``blobs`` always stands for whole content, whatever was killed;
@@ -9,16 +9,15 @@ do rot.
 from __future__ import annotations
 
 import contextlib
-import errno
 import itertools
 import logging
-import os
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from vggt_motion.errors import DiskFullError, LedgerError
+from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, free_space, make_folder
 from vggt_motion.ledger.store import (
     Blob,
     BlobEntry,
@@ -31,82 +30,6 @@ from vggt_motion.ledger.store import (
 
 _LOGGER = logging.getLogger(__name__)
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-class FileOperations:
-    """The file operations that durability rests on, apart so that tests can record them and let them fail."""
-
-    def write_and_sync(self, path: Path, data: bytes) -> None:
-        """Create a file with this content and force it to the disk."""
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        try:
-            view = memoryview(data)
-            while view:
-                view = view[os.write(descriptor, view) :]
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-    def rename(self, source: Path, target: Path) -> None:
-        """Move a file within the file system, atomically; replaces ``target``."""
-        source.replace(target)
-
-    def sync_folder(self, folder: Path) -> None:
-        """Force the entries of a folder to the disk."""
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def make_folder(folder: Path, files: FileOperations) -> None:
-    """Create a folder with its parents, durably."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    for path in reversed(missing):
-        path.mkdir(exist_ok=True)
-        files.sync_folder(path.parent)
-
-
-def free_space(folder: Path) -> int:
-    """Bytes that an ordinary process may still write to the file system of ``folder``."""
-    stat = os.statvfs(folder)
-    return stat.f_bavail * stat.f_frsize
-
-
-class _FolderSync:
-    """Forces the entries of one folder to the disk, once for all threads that ask while a sync is under way."""
-
-    def __init__(self, folder: Path, files: FileOperations) -> None:
-        self._folder = folder
-        self._files = files
-        self._condition = threading.Condition()
-        self._asked = 0
-        self._done = 0  # every entry that was made before so many asked is durable
-        self._is_running = False
-
-    def __call__(self) -> None:
-        """Return when every entry that the caller made before is durable."""
-        with self._condition:
-            self._asked += 1
-            ticket = self._asked
-            while self._is_running and self._done < ticket:
-                self._condition.wait()
-            if self._done >= ticket:
-                return
-            self._is_running = True
-            covered = self._asked
-        is_synced = False
-        try:
-            self._files.sync_folder(self._folder)
-            is_synced = True
-        finally:
-            with self._condition:
-                self._is_running = False
-                if is_synced:
-                    self._done = max(self._done, covered)
-                self._condition.notify_all()
 
 
 class BlobFiles:
@@ -136,7 +59,7 @@ class BlobFiles:
         self._free_bytes = free_bytes or (lambda: free_space(folder))
         self._counter = itertools.count()
         # One folder for all names, so that many writes share the sync of its entries.
-        self._sync_names = _FolderSync(folder, self._files)
+        self._sync_names = SharedSync(lambda: self._files.sync_folder(folder))
         self._lock = threading.Lock()
         self._claimed_bytes = 0  # of writes that are under way: many at once must not overshoot the reserve together
         try:
@@ -160,7 +83,7 @@ class BlobFiles:
                 if hashed:
                     self._sync_names()
             except OSError as error:
-                if error.errno in _NO_SPACE:
+                if error.errno in NO_SPACE:
                     raise DiskFullError(f"no space for {size_bytes} bytes in {self._folder}") from error
                 raise LedgerError(f"cannot write to {self._folder}: {error.strerror or error}") from error
         return [blob.entry for blob in hashed]
@@ -185,6 +108,10 @@ class BlobFiles:
             return self._path(sha256).stat().st_size == size_bytes
         except OSError:
             return False
+
+    def path(self, sha256: str) -> Path:
+        """The file of a blob, whether it is there or not."""
+        return self._path(sha256)
 
     def free_bytes(self) -> int:
         """Space left in bytes."""

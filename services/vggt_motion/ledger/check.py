@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from vggt_motion.errors import LedgerError
 from vggt_motion.ledger.blobs import BlobFiles
-from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, locked
+from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, PACKS_NAME, locked
 from vggt_motion.ledger.log import bounded_records, is_intact, set_content_aside
+from vggt_motion.ledger.packs import PackFiles
 from vggt_motion.ledger.sqlite import SqliteRows, integrity_problems, rebuild_indexes
-from vggt_motion.ledger.store import JobRow, Reader, RecordRow, Rows, Transaction, UnknownError, sha256_hex
+from vggt_motion.ledger.store import JobRow, Place, Reader, RecordRow, Rows, Transaction, UnknownError, sha256_hex
 from vggt_motion.records import JobState
 
 _PAGE = 256
@@ -202,7 +204,7 @@ def _reopen(transaction: Transaction, job: JobRow) -> None:
 def _check_blobs(
     directory: Path, rows: Rows, referenced: dict[str, tuple[int, str]], findings: _Findings, *, repair: bool
 ) -> tuple[int, int]:
-    """Number of sound blobs, and the bytes of those that are files."""
+    """Number of sound blobs, and the bytes of those that are not among the rows."""
     blobs = BlobFiles(directory / BLOBS_NAME)
     orphans = [sha256 for sha256 in blobs.names() if sha256 not in referenced]
     # With damaged rows it is not known which blobs they refer to: then none is an orphan for certain.
@@ -212,10 +214,16 @@ def _check_blobs(
         for sha256 in orphans if repair else ():
             blobs.remove(sha256)
     count = total_bytes = 0
+    packs = PackFiles(directory / PACKS_NAME)
+    if not findings.problems:
+        _check_ends_of_packs(rows, packs, findings, repair=repair)
     for sha256, (size_bytes, name) in sorted(referenced.items()):
-        content = rows.read(lambda reader, sha256=sha256: reader.find_content(sha256))  # type: ignore[misc]
+        content, place = rows.read(functools.partial(_content_and_place, sha256=sha256))
+        if place is not None:
+            content = packs.read(place)
         if content is not None and sha256_hex(content) == sha256:
             count += 1
+            total_bytes += 0 if place is None else size_bytes
             continue
         if content is not None:
             if repair:
@@ -236,4 +244,18 @@ def _check_blobs(
             continue
         count += 1
         total_bytes += size_bytes
+    packs.close()
     return count, total_bytes
+
+
+def _content_and_place(reader: Reader, sha256: str) -> tuple[bytes | None, Place | None]:
+    return reader.find_content(sha256), reader.find_place(sha256)
+
+
+def _check_ends_of_packs(rows: Rows, packs: PackFiles, findings: _Findings, *, repair: bool) -> None:
+    """Cut off what was written behind the last blob that a row knows: it was never acknowledged."""
+    used = rows.read(lambda reader: [place for _, place in reader.blobs() if place is not None])
+    for number, size_bytes in packs.unused_bytes(used).items():
+        findings.repair(f"{size_bytes} bytes of writes that were never acknowledged removed from pack {number}")
+        if repair:
+            packs.cut_off(number, size_bytes)

@@ -1,8 +1,9 @@
 """One session's directory: the lock, the database and the blobs, opened and closed as one.
 
 DIR/session.lock   held exclusively by the process that serves the session
-DIR/ledger.db      rows and small payloads (and ledger.db-wal, ledger.db-shm while it is open)
+DIR/ledger.db      rows (and ledger.db-wal, ledger.db-shm while it is open)
 DIR/blobs/         large payloads by their hash
+DIR/blobs/packs/   small payloads, many in a file
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ from pathlib import Path
 from typing import Final
 
 from vggt_motion.errors import LedgerError
-from vggt_motion.ledger.blobs import BlobFiles, FileOperations, make_folder
+from vggt_motion.ledger.blobs import BlobFiles
+from vggt_motion.ledger.files import FileOperations, make_folder
 from vggt_motion.ledger.jobs import JobPolicy, JobQueue
-from vggt_motion.ledger.log import INLINE_BLOB_BYTES, Store
+from vggt_motion.ledger.log import PACKED_BLOB_BYTES, Store
+from vggt_motion.ledger.packs import PackFiles, read_place
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
 from vggt_motion.ledger.store import NewRecord, Transaction, UnknownError
 from vggt_motion.records import JobReport
@@ -27,6 +30,7 @@ from vggt_motion.records import JobReport
 DATABASE_NAME: Final = "ledger.db"
 LOCK_NAME: Final = "session.lock"
 BLOBS_NAME: Final = "blobs"
+PACKS_NAME: Final = "blobs/packs"
 _LEDGER_ID = "ledger_id"
 _PATIENCE_S = 0.5
 
@@ -106,7 +110,7 @@ class Ledger:
         *,
         reserve_bytes: int = 0,
         input_streams: Collection[str] = (),
-        inline_blob_bytes: int = INLINE_BLOB_BYTES,
+        packed_blob_bytes: int = PACKED_BLOB_BYTES,
         policy: JobPolicy | None = None,
         result_streams: Mapping[str, str],
         dead_event: Callable[[JobReport], NewRecord],
@@ -122,12 +126,12 @@ class Ledger:
             directory: created if it is not there.
             reserve_bytes: see :class:`.log.Store`.
             input_streams: see :class:`.log.Store`.
-            inline_blob_bytes: see :class:`.log.Store`.
+            packed_blob_bytes: see :class:`.log.Store`.
             policy: see :class:`.jobs.JobQueue`.
             result_streams: see :class:`.jobs.JobQueue`.
             dead_event: see :class:`.jobs.JobQueue`.
             free_bytes: space left in bytes; defaults to asking the file system.
-            files: the file operations of the blobs; defaults to the real ones.
+            files: the file operations of blobs and packs; defaults to the real ones.
             clock: seconds, monotonic.
             time_ns: wall clock, informative.
             new_lease_id: see :class:`.jobs.JobQueue`.
@@ -145,15 +149,18 @@ class Ledger:
             lock = SessionLock(directory)
             undo.callback(lock.release)
             self.blobs = BlobFiles(directory / BLOBS_NAME, free_bytes=free_bytes, files=files)
+            self.packs = PackFiles(directory / PACKS_NAME, files=files)
+            undo.callback(self.packs.close)
             self.rows = SqliteRows(directory / DATABASE_NAME)
             undo.callback(self.rows.close)
             files.sync_folder(directory)
             self.store = Store(
                 self.rows,
                 self.blobs,
+                self.packs,
                 reserve_bytes=reserve_bytes,
                 input_streams=input_streams,
-                inline_blob_bytes=inline_blob_bytes,
+                packed_blob_bytes=packed_blob_bytes,
                 time_ns=time_ns,
             )
             self.jobs = JobQueue(
@@ -191,10 +198,12 @@ def stored_blob(directory: Path, sha256: str) -> bytes:
         UnknownError: it has no such blob.
     """
     with read_only(directory / DATABASE_NAME) as reader:
-        content = reader.find_content(sha256)
-    if content is not None:
+        content, place = reader.find_content(sha256), reader.find_place(sha256)
+    if content is not None and place is None:
         return content
     try:
+        if place is not None:
+            return read_place(directory / PACKS_NAME, place)
         return (directory / BLOBS_NAME / sha256).read_bytes()
     except FileNotFoundError:
         raise UnknownError(f"no blob {sha256} in {directory}") from None

@@ -1,4 +1,4 @@
-"""A session as one file, and back: a tar archive with the database and the blobs that are files beside it."""
+"""A session as one file, and back: a tar archive with the database and the blobs beside it, each a file of its own."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from vggt_motion.errors import InputError, LedgerError
-from vggt_motion.ledger.blobs import BlobFiles, FileOperations
-from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, locked
-from vggt_motion.ledger.sqlite import copy_database, read_only
-from vggt_motion.ledger.store import BlobEntry, Reader, sha256_hex
+from vggt_motion.ledger.blobs import BlobFiles
+from vggt_motion.ledger.directory import BLOBS_NAME, DATABASE_NAME, PACKS_NAME, locked
+from vggt_motion.ledger.files import FileOperations
+from vggt_motion.ledger.packs import read_place
+from vggt_motion.ledger.sqlite import copy_database, read_only, take_out_of_packs
+from vggt_motion.ledger.store import BlobEntry, Place, Reader, sha256_hex
 
 _MAX_BLOB_BYTES = 2**30
 
@@ -50,15 +52,15 @@ def export_session(directory: Path, archive: Path) -> ExportReport:
         with tempfile.TemporaryDirectory(dir=archive.parent) as scratch, tarfile.open(partial, "w") as tar:
             snapshot = Path(scratch) / DATABASE_NAME
             copy_database(directory / DATABASE_NAME, snapshot)
-            tar.add(snapshot, DATABASE_NAME)
             with read_only(snapshot) as reader:
                 counts = dict(reader.positions())
                 blob_count = _check_contents(reader)
-                entries = list(reader.file_blobs())
+                entries = list(reader.blobs())
+            take_out_of_packs(snapshot)
+            tar.add(snapshot, DATABASE_NAME)
             # Blobs never change and are never removed while a record refers to them: no lock is needed.
-            blobs = directory / BLOBS_NAME
-            for entry in entries:
-                _add(tar, entry, blobs / entry.sha256)
+            for entry, place in entries:
+                _add(tar, entry, _content(directory, entry, place))
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         FileOperations().rename(partial, archive)
@@ -120,7 +122,7 @@ def _import(archive: Path, directory: Path) -> ExportReport:
     with read_only(snapshot) as reader:
         counts = dict(reader.positions())
         blob_count = _check_contents(reader)
-        missing = set(reader.file_blobs()) - found
+        missing = {entry for entry, _ in reader.blobs()} - found
     if missing:
         raise InputError(f"cannot import {archive}: {len(missing)} blobs are missing")
     FileOperations().rename(snapshot, directory / DATABASE_NAME)
@@ -138,11 +140,16 @@ def _check_contents(reader: Reader) -> int:
     return count
 
 
-def _add(tar: tarfile.TarFile, entry: BlobEntry, path: Path) -> None:
+def _content(directory: Path, entry: BlobEntry, place: Place | None) -> bytes:
     try:
-        data = path.read_bytes()
+        if place is not None:
+            return read_place(directory / PACKS_NAME, place)
+        return (directory / BLOBS_NAME / entry.sha256).read_bytes()
     except FileNotFoundError:
         raise LedgerError(f"blob {entry.sha256} is missing; run a check") from None
+
+
+def _add(tar: tarfile.TarFile, entry: BlobEntry, data: bytes) -> None:
     if BlobEntry(sha256_hex(data), len(data)) != entry:
         raise LedgerError(f"blob {entry.sha256} is damaged; run a check")
     info = tarfile.TarInfo(f"{BLOBS_NAME}/{entry.sha256}")

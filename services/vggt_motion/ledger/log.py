@@ -1,8 +1,8 @@
 """The durable log: streams of records with dense sequence numbers, appended idempotently, and the blobs they refer to.
 
-An append is acknowledged when its blobs and its row have been forced to the disk: small blobs with the row, in one
-commit; large ones before it, as files, for a database would write them twice. It may be repeated at will: the
-same identity under the same id is acknowledged again with the same sequence number, another identity is refused.
+An append is acknowledged when its blobs and then its row have been forced to the disk: small blobs in a pack, whose
+sync those that come together share; large ones as files. It may be repeated at will: the same identity under the same
+id is acknowledged again with the same sequence number, another identity is refused.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import re
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 from vggt_motion.errors import DiskFullError, VggtMotionError
@@ -24,6 +25,8 @@ from vggt_motion.ledger.store import (
     DamagedBlobError,
     InvalidRequestError,
     NewRecord,
+    Packs,
+    Place,
     Reader,
     RecordRow,
     Rows,
@@ -41,12 +44,8 @@ MAX_READ_RECORDS = 1000
 MAX_READ_BYTES = 8 * 2**20
 IDENTITY_BYTES = 32
 
-INLINE_BLOB_BYTES = 512 * 2**10
-"""Blobs up to this length are kept among the rows.
-
-Measured at 100 kB: one after the other, a record with its blob among the rows takes a third of the time of one with a
-file (one sync in place of three); of 64 at a time, which share a commit, 1.3 times as many are stored.
-"""
+PACKED_BLOB_BYTES = 512 * 2**10
+"""Blobs up to this length lie in packs."""
 
 _STREAM = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _IDENTIFIER = re.compile(r"[!-~]+")
@@ -73,18 +72,27 @@ class Prepared:
     """The blobs of a record that is about to be added."""
 
     entries: tuple[BlobEntry, ...] = ()  # every blob that the record refers to
-    contents: tuple[Blob, ...] = ()  # those among them that are to be kept with the row
+    places: tuple[tuple[BlobEntry, Place], ...] = ()  # where those among them lie that have been packed for it
 
 
 _NOTHING = Prepared()
+
+
+class _Needs(NamedTuple):
+    """What has to become durable before the row of a record."""
+
+    entries: tuple[BlobEntry, ...]
+    small: dict[BlobEntry, bytes]
+    large: list[Blob]
+    keep_free_bytes: int
 
 
 @dataclass(frozen=True)
 class Sizes:
     """Bytes of a session on disk."""
 
-    row_bytes: int  # with the small blobs
-    blob_bytes: int  # of the large ones
+    row_bytes: int
+    blob_bytes: int
     free_bytes: int
 
 
@@ -95,27 +103,30 @@ class Store:
         self,
         rows: Rows,
         blobs: Blobs,
+        packs: Packs,
         *,
         reserve_bytes: int = 0,
         input_streams: Collection[str] = (),
-        inline_blob_bytes: int = INLINE_BLOB_BYTES,
+        packed_blob_bytes: int = PACKED_BLOB_BYTES,
         time_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Put the log's rules on top of rows and blobs.
 
         Args:
             rows: durable rows.
-            blobs: durable blobs.
+            blobs: durable blobs, the large ones.
+            packs: durable blobs, the small ones.
             reserve_bytes: free bytes below which new input is refused; everything else may use half of them.
             input_streams: the streams that bring new input, and with it more work and more data.
-            inline_blob_bytes: length up to which new blobs are kept among the rows.
+            packed_blob_bytes: length up to which new blobs are packed.
             time_ns: wall clock, informative.
         """
         self._rows = rows
         self._blobs = blobs
+        self._packs = packs
         self.reserve_bytes = reserve_bytes
         self._input_streams = frozenset(input_streams)
-        self._inline_blob_bytes = inline_blob_bytes
+        self._packed_blob_bytes = packed_blob_bytes
         self._time_ns = time_ns
 
     def append(
@@ -146,7 +157,7 @@ class Store:
             For each, in order, its acknowledgement or what :meth:`append` would have raised.
         """
         outcomes: dict[int, Appended | Exception] = {}
-        changes: dict[int, Callable[[Transaction], Appended]] = {}
+        needed: dict[int, _Needs] = {}
         for index, entry in enumerate(wanted):
             try:
                 known = self._known(entry)
@@ -154,10 +165,15 @@ class Store:
                     outcomes[index] = known
                     continue
                 is_input = entry.record.stream in self._input_streams
-                prepared = self.prepare(entry.blobs, entry.references, is_input=is_input)
-                changes[index] = functools.partial(self.add, record=entry.record, prepared=prepared)
+                needed[index] = self._needs(entry.blobs, entry.references, is_input=is_input)
             except VggtMotionError as error:
                 outcomes[index] = error
+        changes: dict[int, Callable[[Transaction], Appended]] = {}
+        for index, prepared in zip(needed, self._kept(list(needed.values())), strict=True):
+            if isinstance(prepared, Exception):
+                outcomes[index] = prepared
+            else:
+                changes[index] = functools.partial(self.add, record=wanted[index].record, prepared=prepared)
         written: Sequence[Appended | Exception] = ()
         try:
             if changes:
@@ -178,13 +194,20 @@ class Store:
         return Appended(known.sequence, was_known=True)
 
     def prepare(self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> Prepared:
-        """Make the large blobs of a record durable, before its row, and see that every blob will be there.
+        """Make the blobs of a record durable, before its row, and see that every blob will be there.
 
         Raises:
             InvalidRequestError: too many.
             UnknownError: a reference to a blob that is neither here nor stored.
             DiskFullError: not enough space.
         """
+        (outcome,) = self._kept([self._needs(blobs, references, is_input=is_input)])
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def _needs(self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> _Needs:
+        """What :meth:`prepare` has to do, after it was checked."""
         if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
             raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")
         keep_free_bytes = self.reserve_bytes if is_input else self.reserve_bytes // 2
@@ -202,24 +225,61 @@ class Store:
                 raise UnknownError(
                     f"no blob {reference.sha256} of {reference.size_bytes} bytes, to which the record refers"
                 )
-        small = {blob.entry.sha256: blob for blob in hashed if len(blob.data) <= self._inline_blob_bytes}
-        # The write-ahead log and the database hold each for a while.
-        small_bytes = 2 * sum(blob.entry.size_bytes for blob in small.values())
+        small = {blob.entry: blob.data for blob in hashed if len(blob.data) <= self._packed_blob_bytes}
+        small_bytes = sum(entry.size_bytes for entry in small)
         if free_bytes < small_bytes:
             raise DiskFullError(f"the ledger's disk has no space for {small_bytes} bytes: {free_bytes} are left")
-        large = [blob for blob in hashed if blob.entry.sha256 not in small]
-        if large:
-            self._blobs.put(large, keep_free_bytes=keep_free_bytes)
+        large = [blob for blob in hashed if blob.entry not in small]
         entries = sorted({*(blob.entry for blob in hashed), *references}, key=lambda entry: entry.sha256)
-        return Prepared(tuple(entries), tuple(small.values()))
+        return _Needs(tuple(entries), small, large, keep_free_bytes)
+
+    def _kept(self, needed: Sequence[_Needs]) -> list[Prepared | Exception]:
+        """Make the blobs of several records durable: the small ones under one sync, of the others each for itself."""
+        outcomes: list[Prepared | Exception] = []
+        packed: dict[BlobEntry, Place] = {}
+        failure: VggtMotionError | None = None
+        try:
+            new = self._not_kept({entry: data for needs in needed for entry, data in needs.small.items()})
+            packed = dict(zip(new, self._packs.append(list(new.values())), strict=True))
+        except VggtMotionError as error:
+            failure = error
+        for needs in needed:
+            if needs.small and failure is not None:
+                outcomes.append(failure)
+                continue
+            try:
+                if needs.large:
+                    self._blobs.put(needs.large, keep_free_bytes=needs.keep_free_bytes)
+            except VggtMotionError as error:
+                outcomes.append(error)
+                continue
+            places = tuple((entry, packed[entry]) for entry in needs.small if entry in packed)
+            outcomes.append(Prepared(needs.entries, places))
+        return outcomes
+
+    def _not_kept(self, small: dict[BlobEntry, bytes]) -> dict[BlobEntry, bytes]:
+        """Those that are not in a pack yet, or damaged there: then they come back so."""
+        if not small:
+            return small
+        places, contents = self._rows.read(
+            lambda reader: (
+                {entry: reader.find_place(entry.sha256) for entry in small},
+                {entry: reader.find_content(entry.sha256) for entry in small},
+            )
+        )
+
+        def is_kept(entry: BlobEntry, data: bytes) -> bool:
+            place = places[entry]
+            return data == (contents[entry] if place is None else self._packs.read(place))
+
+        return {entry: data for entry, data in small.items() if not is_kept(entry, data)}
 
     def add(self, transaction: Transaction, record: NewRecord, prepared: Prepared = _NOTHING) -> Appended:
         """Append within a larger change; the record must be checked and its blobs prepared already."""
         known = self._find_known(transaction, record)
-        for blob in prepared.contents:
+        for entry, place in prepared.places:
             # Also of a known record: a content that was damaged comes back so.
-            if transaction.find_content(blob.entry.sha256) != blob.data:
-                transaction.set_content(blob.entry.sha256, blob.data)
+            transaction.set_place(entry, place)
         if known is not None:
             return Appended(known.sequence, was_known=True)
         sequence = transaction.next_sequence(record.stream)
@@ -262,7 +322,9 @@ class Store:
             UnknownError: there is no such blob.
             DamagedBlobError: its bytes are not what they were.
         """
-        content = self._rows.read(lambda reader: reader.find_content(sha256))
+        content, place = self._rows.read(lambda reader: (reader.find_content(sha256), reader.find_place(sha256)))
+        if place is not None:
+            content = self._packs.read(place)
         if content is None:
             return self._blobs.get(sha256)
         if sha256_hex(content) != sha256:
@@ -270,13 +332,31 @@ class Store:
             raise DamagedBlobError(f"blob {sha256} is damaged: {len(content)} bytes with another hash")
         return content
 
+    def place(self, sha256: str) -> tuple[Path, int, int] | None:
+        """File, offset and length in bytes of a blob, for a reader on the same machine that verifies what it reads.
+
+        None: there is no such blob, or it is in no file.
+        """
+        entry, place, is_row = self._rows.read(
+            lambda reader: (
+                reader.find_blob(sha256),
+                reader.find_place(sha256),
+                reader.find_content(sha256) is not None,
+            )
+        )
+        if entry is None or (is_row and place is None):
+            return None
+        path = self._blobs.path(sha256) if place is None else self._packs.path(place)
+        offset_bytes = 0 if place is None else place.offset_bytes
+        return None if path is None else (path, offset_bytes, entry.size_bytes)
+
     def positions(self) -> dict[str, int]:
         """Next sequence number of every stream that has records."""
         return self._rows.read(lambda reader: dict(reader.positions()))
 
     def sizes(self) -> Sizes:
         """Bytes on disk."""
-        blob_bytes = self._rows.read(lambda reader: reader.file_blob_bytes())
+        blob_bytes = self._rows.read(lambda reader: reader.blob_bytes())
         return Sizes(self._rows.size_bytes(), blob_bytes, self._blobs.free_bytes())
 
     @property
@@ -298,12 +378,16 @@ class Store:
         return all(self._has(entry) for entry in entries)
 
     def _has(self, entry: BlobEntry) -> bool:
-        is_row = self._rows.read(lambda reader: reader.has_content(entry.sha256, entry.size_bytes))
+        place, is_row = self._rows.read(
+            lambda reader: (reader.find_place(entry.sha256), reader.has_content(entry.sha256, entry.size_bytes))
+        )
+        if place is not None:
+            return place.size_bytes == entry.size_bytes
         return is_row or self._blobs.has(entry.sha256, entry.size_bytes)
 
 
 def set_content_aside(rows: Rows, blobs: Blobs, sha256: str, content: bytes) -> None:
-    """Take a damaged content out of the rows."""
+    """Forget a damaged small blob, and keep its content for a person."""
     blobs.keep_damaged(sha256, content)
     rows.write(lambda transaction: transaction.remove_content(sha256))
 

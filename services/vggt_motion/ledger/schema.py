@@ -65,5 +65,10 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         "CREATE TABLE contents (sha256 TEXT NOT NULL PRIMARY KEY, content BLOB NOT NULL)",
         "ALTER TABLE blobs ADD COLUMN is_file INTEGER NOT NULL DEFAULT 1",
     ),
+    (
+        # Small blobs lie in packs: among the rows each was written twice. What stands there already stays.
+        "ALTER TABLE blobs ADD COLUMN pack BIGINT NOT NULL DEFAULT 0",
+        "ALTER TABLE blobs ADD COLUMN offset_bytes BIGINT NOT NULL DEFAULT 0",
+    ),
 )
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -96,7 +96,7 @@ def summary_of(directory: Path) -> SessionSummary:
                 started_ns=started.time_ns if started is not None else 0,
                 record_counts=dict(reader.positions()),
                 dead_job_count=sum(count for (_, state), count in reader.job_counts().items() if state == "dead"),
-                stored_bytes=database_bytes(path) + reader.file_blob_bytes(),
+                stored_bytes=database_bytes(path) + reader.blob_bytes(),
                 is_ended=ended,
                 is_in_use=in_use,
                 problem="",

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 
 from vggt_motion.errors import DiskFullError, LedgerError, VggtMotionError
 from vggt_motion.ledger.schema import MIGRATIONS, SCHEMA_VERSION
-from vggt_motion.ledger.store import BlobEntry, JobRow, LeaseRow, Reader, RecordRow, Transaction
+from vggt_motion.ledger.store import BlobEntry, JobRow, LeaseRow, Place, Reader, RecordRow, Transaction
 from vggt_motion.records import JobState
 
 T = TypeVar("T")
@@ -32,6 +32,7 @@ _record_values = operator.attrgetter(*_RECORD_NAMES)
 _JOB_COLUMNS = ", ".join(field.name for field in dataclasses.fields(JobRow))
 _JOB_CONTENT = ("job_id", "submission", "kind", "model", "priority", "payload_type", "payload")
 _JOB_PROGRESS = tuple(field.name for field in dataclasses.fields(JobRow) if field.name not in _JOB_CONTENT)
+_NOT_AMONG_ROWS = "is_file <> 0"  # in a file of its own, or in a pack
 _LEASE_COLUMNS = ", ".join(field.name for field in dataclasses.fields(LeaseRow))
 
 
@@ -64,13 +65,17 @@ class _Statements:
             WHERE stream = ? AND sequence = ? ORDER BY blobs.sha256"""
         return [BlobEntry(*row) for row in self._all(statement, stream, sequence)]
 
-    def file_blobs(self) -> Iterable[BlobEntry]:
-        statement = "SELECT sha256, size_bytes FROM blobs WHERE is_file <> 0 ORDER BY sha256"
-        for row in self._connection.execute(statement):
-            yield BlobEntry(*row)
+    def blob_bytes(self) -> int:
+        return int(self._value(f"SELECT COALESCE(SUM(size_bytes), 0) FROM blobs WHERE {_NOT_AMONG_ROWS}"))
 
-    def file_blob_bytes(self) -> int:
-        return int(self._value("SELECT COALESCE(SUM(size_bytes), 0) FROM blobs WHERE is_file <> 0"))
+    def blobs(self) -> Iterable[tuple[BlobEntry, Place | None]]:
+        statement = f"SELECT sha256, size_bytes, pack, offset_bytes FROM blobs WHERE {_NOT_AMONG_ROWS} ORDER BY sha256"
+        for sha256, size_bytes, pack, offset_bytes in self._connection.execute(statement):
+            yield BlobEntry(sha256, size_bytes), Place(pack, offset_bytes, size_bytes) if pack else None
+
+    def find_place(self, sha256: str) -> Place | None:
+        row = self._one("SELECT pack, offset_bytes, size_bytes FROM blobs WHERE sha256 = ?", sha256)
+        return Place(*row) if row is not None and row[0] else None
 
     def find_content(self, sha256: str) -> bytes | None:
         row = self._one("SELECT content FROM contents WHERE sha256 = ?", sha256)
@@ -149,10 +154,9 @@ class _Statements:
         self._run(_ADD_RECORD, *_record_values(row))
         for blob in sorted(set(blobs), key=lambda blob: blob.sha256):
             self._run(
-                "INSERT INTO blobs (sha256, size_bytes, is_file) VALUES (?, ?, ?) ON CONFLICT (sha256) DO NOTHING",
+                "INSERT INTO blobs (sha256, size_bytes) VALUES (?, ?) ON CONFLICT (sha256) DO NOTHING",
                 blob.sha256,
                 blob.size_bytes,
-                not self.has_content(blob.sha256, blob.size_bytes),
             )
             self._run(
                 "INSERT INTO record_blobs (stream, sequence, sha256) VALUES (?, ?, ?)",
@@ -161,17 +165,19 @@ class _Statements:
                 blob.sha256,
             )
 
-    def set_content(self, sha256: str, content: bytes) -> None:
+    def set_place(self, entry: BlobEntry, place: Place) -> None:
         self._run(
-            """INSERT INTO contents (sha256, content) VALUES (?, ?)
-            ON CONFLICT (sha256) DO UPDATE SET content = excluded.content""",
-            sha256,
-            content,
+            """INSERT INTO blobs (sha256, size_bytes, pack, offset_bytes) VALUES (?, ?, ?, ?)
+            ON CONFLICT (sha256) DO UPDATE SET pack = excluded.pack, offset_bytes = excluded.offset_bytes""",
+            entry.sha256,
+            entry.size_bytes,
+            place.pack,
+            place.offset_bytes,
         )
-        self._run("UPDATE blobs SET is_file = 0 WHERE sha256 = ?", sha256)
 
     def remove_content(self, sha256: str) -> None:
         self._run("DELETE FROM contents WHERE sha256 = ?", sha256)
+        self._run("UPDATE blobs SET is_file = 1, pack = 0, offset_bytes = 0 WHERE sha256 = ?", sha256)
 
     def set_meta(self, key: str, value: str) -> None:
         self._run(
@@ -478,6 +484,13 @@ def copy_database(path: Path, target: Path) -> None:
         source.backup(copy)
         # One plain file, without a write-ahead log beside it.
         copy.execute("PRAGMA journal_mode = DELETE")
+
+
+def take_out_of_packs(path: Path) -> None:
+    """Let a database that nobody serves say that every blob has a file of its own."""
+    with _errors_of(path), contextlib.closing(connect(path)) as connection:
+        connection.execute("UPDATE blobs SET pack = 0, offset_bytes = 0 WHERE pack <> 0")
+        connection.execute("PRAGMA journal_mode = DELETE")
 
 
 def database_bytes(path: Path) -> int:

@@ -1,8 +1,8 @@
 """What the ledger needs of a store: rows in atomic transactions, and blobs addressed by their content.
 
-The two interfaces are small on purpose, so that PostgreSQL and an object store can stand behind them for servers with
-many vehicles, while SQLite (:mod:`.sqlite`) and files (:mod:`.blobs`) stay the embedded default. Every method of
-:class:`Transaction` is a plain SQL statement or two; :meth:`Transaction.next_open_job` is
+The interfaces are small on purpose, so that PostgreSQL and an object store can stand behind them for servers with
+many vehicles, while SQLite (:mod:`.sqlite`) and files (:mod:`.blobs`, :mod:`.packs`) stay the embedded default.
+Every method of :class:`Transaction` is a plain SQL statement or two; :meth:`Transaction.next_open_job` is
 ``SELECT ... ORDER BY priority, submission LIMIT 1 FOR UPDATE SKIP LOCKED``.
 
 Policy (what is idempotent, when a job is dead) lives in :mod:`.log` and :mod:`.jobs` and knows neither implementation.
@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 from vggt_motion.errors import RefusalCode, RequestRefusedError
@@ -48,6 +49,15 @@ class BlobEntry:
     """One blob as the rows know it."""
 
     sha256: str  # 64 lower-case hexadecimal digits
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a small blob lies among others."""
+
+    pack: int  # from 1
+    offset_bytes: int
     size_bytes: int
 
 
@@ -143,14 +153,17 @@ class Reader(Protocol):
     def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
         """The blobs that a record refers to."""
 
-    def file_blobs(self) -> Iterable[BlobEntry]:
+    def blob_bytes(self) -> int:
+        """Sum of the sizes of the blobs whose content is not among the rows."""
+
+    def blobs(self) -> Iterable[tuple[BlobEntry, Place | None]]:
         """The blobs whose content is not among the rows, in order of their hash, as long as the query lasts."""
 
-    def file_blob_bytes(self) -> int:
-        """Sum of their sizes, each counted once."""
+    def find_place(self, sha256: str) -> Place | None:
+        """Where the blob lies if it is in a pack."""
 
     def find_content(self, sha256: str) -> bytes | None:
-        """The content of a blob that is kept among the rows; not verified."""
+        """The content of a blob that an older version kept among the rows; not verified."""
 
     def has_content(self, sha256: str, size_bytes: int) -> bool:
         """Whether it is there with this size."""
@@ -197,13 +210,13 @@ class Transaction(Reader, Protocol):
         """The next sequence number of a stream, taken: it is used up if and only if the change commits."""
 
     def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
-        """Insert a record and its references to blobs, whose contents are there already, among the rows or not."""
+        """Insert a record and its references to blobs, whose contents are durable already."""
 
-    def set_content(self, sha256: str, content: bytes) -> None:
-        """Insert or replace the content of a blob."""
+    def set_place(self, entry: BlobEntry, place: Place) -> None:
+        """Insert a blob that lies in a pack, or say where it lies now."""
 
     def remove_content(self, sha256: str) -> None:
-        """Delete the content of a blob."""
+        """Forget the content of a blob among the rows, or its place in a pack."""
 
     def set_meta(self, key: str, value: str) -> None:
         """Insert or replace a fact about the session."""
@@ -280,11 +293,31 @@ class Blobs(Protocol):
     def has(self, sha256: str, size_bytes: int) -> bool:
         """Whether the blob is there with this size; its content is verified on :meth:`get`."""
 
+    def path(self, sha256: str) -> Path | None:
+        """The file that holds the blob and nothing else, for readers on the same machine; None: there is none."""
+
     def free_bytes(self) -> int:
         """Space left for more."""
 
     def keep_damaged(self, sha256: str, data: bytes) -> None:
         """Keep a content that is not what it was where a person can look at it."""
+
+
+class Packs(Protocol):
+    """Durable bytes at places that the rows know: those that are too small for a file of their own."""
+
+    def append(self, contents: Sequence[bytes]) -> list[Place]:
+        """Make contents durable, in order; durable on return, under one sync.
+
+        Raises:
+            DiskFullError: there is no space; nothing was kept.
+        """
+
+    def read(self, place: Place) -> bytes:
+        """What lies at a place; not verified."""
+
+    def path(self, place: Place) -> Path | None:
+        """The file that a place is in, for readers on the same machine; None: there is none."""
 
 
 def sha256_hex(data: bytes) -> str:
