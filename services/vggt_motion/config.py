@@ -40,6 +40,9 @@ class BusConfig(Section):
     connect_timeout_s: float = Field(10.0, gt=0, description="how long to try to reach the router before giving up")
     request_timeout_s: float = Field(10.0, gt=0, description="how long one acknowledged request may take")
     shared_memory: bool = Field(False, description="explicit single-host switch; has hazards, see the documentation")
+    local_parcels: bool = Field(
+        True, description="long payloads between processes of one machine go by files in memory instead of the router"
+    )
     zenoh_config: Path | None = Field(None, description="JSON5 file merged under ours (TLS, authentication)")
 
 

@@ -247,6 +247,12 @@ STRATEGIES: dict[type, st.SearchStrategy[Any]] = {
     LogEntry: log_entries,
     LedgerStatus: statuses,
     calls.Refusal: st.builds(calls.Refusal, st.sampled_from(RefusalCode), lines),
+    calls.Parcel: st.builds(
+        calls.Parcel,
+        st.binary(min_size=16, max_size=16).map(bytes.hex),
+        st.from_regex("[0-9a-z-]{0,64}", fullmatch=True),
+        st.integers(0, 2**29),
+    ),
     calls.AppendRequest: appends,
     calls.AppendReply: st.builds(calls.AppendReply, indices, st.booleans()),
     calls.ReadRequest: st.builds(calls.ReadRequest, names, indices, counts),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import threading
 import time
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ def test_what_was_appended_is_read_again_by_this_and_another_process(
     flat = [place for batch in places for place in batch]
     assert [read_place(folder, place) for place in flat] == [content for batch in batches for content in batch]
     spans = sorted((place.pack, place.offset_bytes, place.size_bytes) for place in flat if place.size_bytes)
-    for before, after in zip(spans, spans[1:], strict=False):
+    for before, after in itertools.pairwise(spans):
         assert after[0] > before[0] or after[1] == before[1] + before[2], "packs have neither gaps nor overlaps"
     again = PackFiles(folder, max_pack_bytes=max_bytes)
     (more,) = again.append([b"more"])

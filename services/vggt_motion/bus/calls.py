@@ -1,4 +1,4 @@
-"""The calls of the ledger and the job queue as frozen dataclasses, mirrors of ``ledger.proto`` and ``jobs.proto``."""
+"""The calls of ledger and job queue as frozen dataclasses: ``ledger.proto``, ``jobs.proto`` and ``parcel.proto``."""
 
 from __future__ import annotations
 
@@ -14,6 +14,15 @@ class Refusal:
 
     code: RefusalCode
     message: str  # one line
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """Attachment of requests and answers between processes of one machine: where the payload is."""
+
+    folder_id: str
+    name: str = ""  # of a file in the folder; empty: the payload is in the message
+    size_bytes: int = 0
 
 
 @dataclass(frozen=True)

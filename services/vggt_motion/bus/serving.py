@@ -16,6 +16,7 @@ from zenoh import handlers
 
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.delivery import Calls
+from vggt_motion.bus.parcels import Parcels
 from vggt_motion.errors import (
     BusUnavailableError,
     CodecError,
@@ -43,6 +44,7 @@ class _Request:
     """A query that was taken in."""
 
     query: zenoh.Query
+    attachment: bytes | None
     size_bytes: int
 
 
@@ -54,7 +56,14 @@ class Server:
     """
 
     def __init__(
-        self, session: zenoh.Session, key: str, handler: Handler | BatchHandler, *, threads: int, at_a_time: int | None
+        self,
+        session: zenoh.Session,
+        key: str,
+        handler: Handler | BatchHandler,
+        parcels: Parcels,
+        *,
+        threads: int,
+        at_a_time: int | None,
     ) -> None:
         """Declare the queryable.
 
@@ -62,10 +71,12 @@ class Server:
             session: where it is declared.
             key: may hold wildcards, if not ``at_a_time``.
             handler: of one request, or of a batch.
+            parcels: how long payloads come and go within this machine.
             threads: so many may answer at the same time.
             at_a_time: how many requests a batch may hold; None: ``handler`` takes one.
         """
         self._handler: Any = handler
+        self._parcels = parcels
         self._key = key
         self._max_answering = threads
         self._at_a_time = at_a_time
@@ -111,12 +122,14 @@ class Server:
 
     def _admit(self, query: zenoh.Query) -> bool:
         """Let a query wait, if there is room; with the lock."""
+        attachment = _attachment_of(query)
         size_bytes = len(query.payload) if query.payload is not None else 0
+        size_bytes += self._parcels.size_bytes(attachment)
         is_full = len(self._waiting) >= _MAX_PENDING or self._held_bytes + size_bytes > _MAX_PENDING_BYTES
         if is_full or self.is_closed:
             return False
         self._held_bytes += size_bytes
-        self._waiting.append(_Request(query, size_bytes))
+        self._waiting.append(_Request(query, attachment, size_bytes))
         return True
 
     def _turn_away(self, query: zenoh.Query) -> None:
@@ -145,7 +158,7 @@ class Server:
                     batch = self._next_batch()
 
     def _answer(self, batch: Sequence[_Request]) -> None:
-        requests: list[tuple[zenoh.Query, str, bytes]] = []
+        requests: list[tuple[_Request, str, bytes]] = []
         for request in batch:
             query = request.query
             key = str(query.key_expr)
@@ -154,7 +167,11 @@ class Server:
             elif "*" in key:
                 _refuse(query, RefusalCode.INVALID, "a request names one key, without wildcards")
             else:
-                requests.append((query, key, query.payload.to_bytes() if query.payload is not None else b""))
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                try:
+                    requests.append((request, key, self._parcels.take(payload, request.attachment)))
+                except BusUnavailableError as error:
+                    _refuse(query, RefusalCode.UNAVAILABLE, str(error))
         outcomes: Sequence[bytes | Exception]
         try:
             if self._at_a_time is None:
@@ -163,8 +180,23 @@ class Server:
                 outcomes = self._handler([payload for _, _, payload in requests])
         except Exception as error:
             outcomes = [error] * len(requests)
-        for (query, key, payload), outcome in zip(requests, outcomes, strict=True):
-            _reply(query, key, outcome, len(payload))
+        for (request, key, payload), outcome in zip(requests, outcomes, strict=True):
+            self._reply(request, key, outcome, len(payload))
+
+    def _reply(self, request: _Request, key: str, outcome: bytes | Exception, request_bytes: int) -> None:
+        if isinstance(outcome, VggtMotionError):
+            _refuse(request.query, refusal_code(outcome), str(outcome))
+        elif isinstance(outcome, Exception):
+            extra = {"key": key, "bytes": request_bytes}
+            _log.error("a request ended in a defect of ours", extra=extra, exc_info=outcome)
+            _refuse(request.query, RefusalCode.INTERNAL, f"internal error: {type(outcome).__name__}")
+        else:
+            is_near = self._parcels.is_near(request.attachment)
+            parcel = self._parcels.leave_answer(outcome) if is_near else None
+            payload = outcome if parcel is None else b""
+            greeting = self._parcels.greeting if is_near else None
+            attachment = greeting if parcel is None else parcel.attachment
+            _send(request.query, lambda: request.query.reply(key, payload, attachment=attachment))
 
 
 class SleepingServer(Server):
@@ -269,15 +301,8 @@ def error_of(refusal: calls.Refusal) -> VggtMotionError:
     return RequestRefusedError(refusal.message, refusal.code)
 
 
-def _reply(query: zenoh.Query, key: str, outcome: bytes | Exception, request_bytes: int) -> None:
-    if isinstance(outcome, VggtMotionError):
-        _refuse(query, refusal_code(outcome), str(outcome))
-    elif isinstance(outcome, Exception):
-        extra = {"key": key, "bytes": request_bytes}
-        _log.error("a request ended in a defect of ours", extra=extra, exc_info=outcome)
-        _refuse(query, RefusalCode.INTERNAL, f"internal error: {type(outcome).__name__}")
-    else:
-        _send(query, lambda: query.reply(key, outcome))
+def _attachment_of(query: zenoh.Query) -> bytes | None:
+    return None if query.attachment is None else query.attachment.to_bytes()
 
 
 def _refuse(query: zenoh.Query, code: RefusalCode, message: str) -> None:

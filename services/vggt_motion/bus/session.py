@@ -19,6 +19,7 @@ from zenoh import handlers
 
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.keys import Keys
+from vggt_motion.bus.parcels import open_parcels
 from vggt_motion.bus.pubsub import (
     MAX_PAYLOAD_BYTES,
     Closable,
@@ -133,6 +134,8 @@ class Bus:
         self.config = config
         self.keys = Keys(config.session)
         self._session = session
+        self._parcels = open_parcels(config)
+        self._near_keys: set[str] = set()  # who answered there last takes parcels
         self._lock = threading.Lock()
         self._requests: set[zenoh.CancellationToken] = set()
         self._closables: list[Closable] = []
@@ -160,17 +163,25 @@ class Bus:
         """
         if len(payload) > MAX_PAYLOAD_BYTES:
             raise BusError(f"{key}: a request of {len(payload)} bytes is longer than the bus carries")
-        timeout = self.config.request_timeout_s if timeout_s is None else timeout_s
+        try:
+            return self._ask(key, payload, self.config.request_timeout_s if timeout_s is None else timeout_s)
+        except BusUnavailableError:
+            self._near_keys.discard(key)  # the next attempt is a message, whoever answers it
+            raise
+
+    def _ask(self, key: str, payload: bytes, timeout: float) -> bytes:
         token = zenoh.CancellationToken()
         with self._lock:
             if self._interrupted.is_set():
                 raise BusUnavailableError(f"{key}: stopping")
             self._requests.add(token)
+        parcel = self._parcels.leave(payload) if key in self._near_keys else None
         try:
             replies: Any = self._session.get(
                 key,
                 handlers.FifoChannel(2),
-                payload=payload,
+                payload=payload if parcel is None else b"",
+                attachment=self._parcels.greeting if parcel is None else parcel.attachment,
                 timeout=timeout,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -185,8 +196,14 @@ class Bus:
         finally:
             with self._lock:
                 self._requests.discard(token)
+            if parcel is not None:
+                parcel.remove()
         if reply.ok is not None:
-            return bytes(reply.ok.payload.to_bytes())
+            sample = reply.ok
+            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
+            if payload and self._parcels.is_near(attachment):
+                self._near_keys.add(key)
+            return self._parcels.take(sample.payload.to_bytes(), attachment, is_last_reader=True)
         error = reply.err
         if str(error.encoding) != REFUSAL_ENCODING:  # Zenoh's own, such as a timeout
             raise BusUnavailableError(f"{key}: no answer within {timeout:g} s ({error.payload.to_bytes()[:80]!r})")
@@ -203,14 +220,16 @@ class Bus:
         VggtMotionError that it raises becomes an error reply. Waiting requests are bounded; beyond that they are
         refused as unavailable.
         """
-        return self._keep(SleepingServer(self._session, key, handler, threads=threads, at_a_time=None))
+        return self._keep(SleepingServer(self._session, key, handler, self._parcels, threads=threads, at_a_time=None))
 
     def serve_together(self, key: str, handler: BatchHandler, *, at_a_time: int, threads: int = 1) -> Closable:
         """As :meth:`serve`, of up to ``at_a_time`` requests that came while others were being answered, and promptly.
 
         ``handler(payloads)`` returns for each, in order, its answer or the exception that becomes its error reply.
         """
-        return self._keep(PromptServer(self._session, key, handler, threads=threads, at_a_time=at_a_time))
+        return self._keep(
+            PromptServer(self._session, key, handler, self._parcels, threads=threads, at_a_time=at_a_time)
+        )
 
     def publisher(self, key: str, *, blocking: bool, history: int = 0, encoding: str = "") -> Publisher:
         """A publisher on a key.
@@ -294,6 +313,7 @@ class Bus:
             for closable in closables:
                 if not isinstance(closable, Server):
                     closable.close()
+            self._parcels.close()
             self._session.close()  # type: ignore[no-untyped-call]
 
         thread = threading.Thread(target=leave, name="leave the bus", daemon=True)

@@ -109,10 +109,6 @@ class BlobFiles:
         except OSError:
             return False
 
-    def path(self, sha256: str) -> Path:
-        """The file of a blob, whether it is there or not."""
-        return self._path(sha256)
-
     def free_bytes(self) -> int:
         """Space left in bytes."""
         return self._free_bytes()

@@ -13,7 +13,6 @@ import re
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 from vggt_motion.errors import DiskFullError, VggtMotionError
@@ -331,24 +330,6 @@ class Store:
             set_content_aside(self._rows, self._blobs, sha256, content)
             raise DamagedBlobError(f"blob {sha256} is damaged: {len(content)} bytes with another hash")
         return content
-
-    def place(self, sha256: str) -> tuple[Path, int, int] | None:
-        """File, offset and length in bytes of a blob, for a reader on the same machine that verifies what it reads.
-
-        None: there is no such blob, or it is in no file.
-        """
-        entry, place, is_row = self._rows.read(
-            lambda reader: (
-                reader.find_blob(sha256),
-                reader.find_place(sha256),
-                reader.find_content(sha256) is not None,
-            )
-        )
-        if entry is None or (is_row and place is None):
-            return None
-        path = self._blobs.path(sha256) if place is None else self._packs.path(place)
-        offset_bytes = 0 if place is None else place.offset_bytes
-        return None if path is None else (path, offset_bytes, entry.size_bytes)
 
     def positions(self) -> dict[str, int]:
         """Next sequence number of every stream that has records."""

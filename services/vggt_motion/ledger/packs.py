@@ -94,10 +94,6 @@ class PackFiles:
         except OSError as error:
             raise LedgerError(f"cannot read {self._path(place.pack)}: {error.strerror or error}") from error
 
-    def path(self, place: Place) -> Path:
-        """The file that a place is in."""
-        return self._path(place.pack)
-
     def numbers(self) -> list[int]:
         """The numbers of all packs, in order."""
         return sorted(int(match[1]) for path in self._folder.iterdir() if (match := _NAME.fullmatch(path.name)))

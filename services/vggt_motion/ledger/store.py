@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol, TypeVar
 
 from vggt_motion.errors import RefusalCode, RequestRefusedError
@@ -293,9 +292,6 @@ class Blobs(Protocol):
     def has(self, sha256: str, size_bytes: int) -> bool:
         """Whether the blob is there with this size; its content is verified on :meth:`get`."""
 
-    def path(self, sha256: str) -> Path | None:
-        """The file that holds the blob and nothing else, for readers on the same machine; None: there is none."""
-
     def free_bytes(self) -> int:
         """Space left for more."""
 
@@ -315,9 +311,6 @@ class Packs(Protocol):
 
     def read(self, place: Place) -> bytes:
         """What lies at a place; not verified."""
-
-    def path(self, place: Place) -> Path | None:
-        """The file that a place is in, for readers on the same machine; None: there is none."""
 
 
 def sha256_hex(data: bytes) -> str:

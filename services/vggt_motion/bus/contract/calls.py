@@ -37,7 +37,7 @@ from vggt_motion.records import (
     LogEntry,
     StreamPosition,
 )
-from vggt_motion.v1 import jobs_pb2, ledger_pb2
+from vggt_motion.v1 import jobs_pb2, ledger_pb2, parcel_pb2
 
 _PAYLOAD_TYPE = Text(128, 1, re.compile(r"[A-Za-z_][A-Za-z0-9_.]*"), "the full name of a message")
 _JOB_KIND = Choice(JobKind, jobs_pb2.JobKind)
@@ -131,6 +131,16 @@ CALL_PLANS: Final[tuple[Plan, ...]] = (
         calls.Refusal,
         ledger_pb2.Refusal,
         rules={"code": Choice(RefusalCode, ledger_pb2.RefusalCode), "message": LINE},
+    ),
+    plan(
+        calls.Parcel,
+        parcel_pb2.Parcel,
+        rules={
+            "folder_id": Text(32, 32, re.compile("[0-9a-f]{32}"), "32 lower-case hexadecimal digits"),
+            "name": Text(64, 0, re.compile("[0-9a-z-]*"), "the name of a parcel"),
+            "size_bytes": Whole(0, MAX_CALL_BYTES),
+        },
+        max_bytes=256,
     ),
     plan(calls.AppendReply, ledger_pb2.AppendReply, rules={"sequence": INDEX, "was_known": Flag()}),
     plan(

@@ -1,0 +1,288 @@
+"""Long payloads between processes of one machine: left as files in a folder in memory, instead of sent.
+
+Over TCP through the router the kernel copies a payload four times and Zenoh several times more; a file in memory is
+written once and read once. It carries requests and answers only: if anything is not as expected they are sent as
+messages, so that nothing depends on it. What processes that were killed have left behind is removed by the others.
+
+The files are not Zenoh's shared memory: that can be taken away from a reader, and stays when its writer is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import itertools
+import logging
+import os
+import secrets
+import stat
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Final
+
+from vggt_motion.bus import calls, codec
+from vggt_motion.config import BusConfig
+from vggt_motion.errors import BusUnavailableError, CodecError
+
+_log = logging.getLogger(__name__)
+
+MIN_PARCEL_BYTES: Final = 24 * 2**10
+"""Shorter payloads are sent: below this a file costs more than the message."""
+
+_MEMORY = Path("/dev/shm")  # where every Linux has memory as a file system
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_KEPT_FREE = 3  # as many times a parcel's size must be free in memory
+_ANSWER_LIFE_S = 60.0
+_JOIN_ATTEMPTS = 100
+
+
+class Parcel:
+    """A file that this process has left for another."""
+
+    def __init__(self, folder: Path, folder_id: str, name: str, size_bytes: int) -> None:
+        self._path = folder / name
+        self.size_bytes = size_bytes
+        self.attachment = codec.encode(calls.Parcel(folder_id, name, size_bytes))
+        self.ends_s = time.monotonic() + _ANSWER_LIFE_S
+
+    def remove(self) -> None:
+        """Delete the file, if its reader has not."""
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+
+class Parcels:
+    """Leaves nothing: every payload is sent. What it is for stands at :class:`MemoryParcels`."""
+
+    greeting: bytes | None = None
+    """Attachment of a message that carries its payload itself."""
+
+    def leave(self, payload: bytes) -> Parcel | None:
+        """Leave a payload for the other side, which says that it uses the same folder; None: send it."""
+        return None
+
+    def leave_answer(self, payload: bytes) -> Parcel | None:
+        """As :meth:`leave`; it is removed by its reader, or after a while."""
+        return None
+
+    def is_near(self, attachment: bytes | None) -> bool:
+        """Whether a message comes from a process that uses the same folder."""
+        return False
+
+    def size_bytes(self, attachment: bytes | None) -> int:
+        """Length of the payload that a message stands for; 0 if it carries it itself."""
+        if attachment is None or attachment == self.greeting:
+            return 0
+        try:
+            return codec.decode(calls.Parcel, attachment).size_bytes
+        except CodecError:
+            return 0
+
+    def take(self, payload: bytes, attachment: bytes | None, *, is_last_reader: bool = False) -> bytes:
+        """The payload of a message, or what was left in its stead.
+
+        Args:
+            payload: of the message.
+            attachment: of the message.
+            is_last_reader: nobody else reads it: delete the file.
+
+        Raises:
+            BusUnavailableError: it cannot be read; the other side is to send it.
+        """
+        if self.size_bytes(attachment):
+            raise BusUnavailableError("what was left for this process cannot be read: send it")
+        return payload
+
+    def close(self) -> None:
+        """Remove what nobody has taken."""
+
+
+class MemoryParcels(Parcels):
+    """Leaves long payloads in a folder in memory. Thread-safe.
+
+    All processes of one user that join one session at one endpoint use the same folder. Its identity is that of the
+    inode, on this machine since it was started: two sides that name the same one look at the same folder, through
+    whatever containers. Each process holds a lock on a file there: who gets the lock of another may clear up after it,
+    and the folder goes with the last one.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Make or join the folder.
+
+        Raises:
+            OSError: that is not possible here.
+        """
+        self._folder = folder
+        self._prefix = secrets.token_hex(8)
+        self._numbers = itertools.count()
+        self._lock = threading.Lock()
+        self._answers: deque[Parcel] = deque()
+        self._is_closed = False
+        self._lock_descriptor = _joined(folder, self._prefix)
+        self._folder_id = _identity(folder)
+        self.greeting = codec.encode(calls.Parcel(self._folder_id))
+        _clear_up(folder)
+        for other in folder.parent.glob(f"{folder.name.rsplit('-', 1)[0]}-*"):
+            _clear_up(other)
+
+    def leave(self, payload: bytes) -> Parcel | None:
+        """See :meth:`Parcels.leave`."""
+        if len(payload) < MIN_PARCEL_BYTES or self._is_closed:
+            return None
+        name = f"{self._prefix}-{next(self._numbers)}"
+        path = self._folder / name
+        try:
+            space = os.statvfs(self._folder)
+            if space.f_bavail * space.f_frsize < _KEPT_FREE * len(payload):
+                return None
+            _write(path, payload)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                path.unlink()
+            _log.debug("no parcel", extra={"folder": str(self._folder), "reason": error.strerror})
+            return None
+        return Parcel(self._folder, self._folder_id, name, len(payload))
+
+    def leave_answer(self, payload: bytes) -> Parcel | None:
+        """See :meth:`Parcels.leave_answer`."""
+        now_s = time.monotonic()
+        overdue = []
+        with self._lock:
+            while self._answers and self._answers[0].ends_s < now_s:
+                overdue.append(self._answers.popleft())
+        for old in overdue:
+            old.remove()
+        parcel = self.leave(payload)
+        if parcel is not None:
+            with self._lock:
+                self._answers.append(parcel)
+        return parcel
+
+    def is_near(self, attachment: bytes | None) -> bool:
+        """See :meth:`Parcels.is_near`."""
+        if attachment is None or attachment == self.greeting:
+            return attachment is not None
+        return self._parcel(attachment) is not None
+
+    def take(self, payload: bytes, attachment: bytes | None, *, is_last_reader: bool = False) -> bytes:
+        """See :meth:`Parcels.take`."""
+        if attachment is None or attachment == self.greeting:
+            return payload
+        parcel = self._parcel(attachment)
+        if parcel is None:
+            return super().take(payload, attachment)
+        path = self._folder / parcel.name
+        try:
+            content = _read(path, parcel.size_bytes)
+            if is_last_reader:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise BusUnavailableError(f"what was left for this process cannot be read ({error.strerror})") from None
+        if len(content) != parcel.size_bytes:
+            raise BusUnavailableError(f"{len(content)} of {parcel.size_bytes} bytes were left for this process")
+        return content
+
+    def close(self) -> None:
+        """Remove what nobody has taken, and the folder after the last parcel."""
+        with self._lock:
+            if self._is_closed:
+                return
+            self._is_closed = True
+            answers = list(self._answers)
+            self._answers.clear()
+        for parcel in answers:
+            parcel.remove()
+        os.close(self._lock_descriptor)
+        _clear_up(self._folder)
+
+    def _parcel(self, attachment: bytes) -> calls.Parcel | None:
+        try:
+            parcel = codec.decode(calls.Parcel, attachment)
+        except CodecError:
+            return None
+        return parcel if parcel.folder_id == self._folder_id and parcel.name else None
+
+
+def open_parcels(config: BusConfig) -> Parcels:
+    """The parcels of a session, as far as this machine and the configuration allow them."""
+    if not config.local_parcels or not _MEMORY.is_dir():
+        return Parcels()
+    digest = hashlib.sha256(f"{config.endpoint}\0{config.session}".encode()).hexdigest()[:16]
+    try:
+        return MemoryParcels(_MEMORY / f"vggt_motion-{os.geteuid()}-{digest}")
+    except OSError as error:
+        _log.info("payloads are sent to processes of this machine too", extra={"reason": str(error)})
+        return Parcels()
+
+
+def _write(path: Path, payload: bytes) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    try:
+        view = memoryview(payload)
+        while view:
+            view = view[os.write(descriptor, view) :]
+    finally:
+        os.close(descriptor)
+
+
+def _read(path: Path, size_bytes: int) -> bytes:
+    """So many bytes of a plain file of this length; whatever else stands under the name is not waited for."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_size != size_bytes:
+            raise OSError(errno.EINVAL, "not the file that was spoken of")
+        return os.read(descriptor, size_bytes)
+    finally:
+        os.close(descriptor)
+
+
+def _joined(folder: Path, prefix: str) -> int:
+    """Make the folder and a lock in it that says that this process uses it; returns the descriptor that holds it."""
+    lock = folder / f"{prefix}.lock"
+    for _ in range(_JOIN_ATTEMPTS):
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+            raise PermissionError(errno.EPERM, "not a folder of our own", str(folder))
+        try:
+            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except FileNotFoundError:
+            continue  # the last one of before has just left
+        if _try_lock(descriptor) and lock.exists():
+            return descriptor
+        os.close(descriptor)  # somebody cleared it up before it was held
+    raise OSError(errno.EAGAIN, "others keep clearing it up", str(folder))
+
+
+def _identity(folder: Path) -> str:
+    found = folder.stat()
+    boot_id = _BOOT_ID.read_text(encoding="ascii").strip()
+    return hashlib.sha256(f"{boot_id} {found.st_dev} {found.st_ino}".encode()).hexdigest()[:32]
+
+
+def _clear_up(folder: Path) -> None:
+    """Remove what processes that are gone have left, and the folder if nobody uses it."""
+    with contextlib.suppress(OSError):
+        for lock in folder.glob("*.lock"):
+            descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+            try:
+                if _try_lock(descriptor):
+                    for path in (*folder.glob(f"{lock.stem}-*"), lock):
+                        path.unlink(missing_ok=True)
+            finally:
+                os.close(descriptor)
+        folder.rmdir()
+
+
+def _try_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vggt_motion.bus import calls, codec, parcels
+from vggt_motion.bus.parcels import MIN_PARCEL_BYTES, MemoryParcels, Parcels, open_parcels
+from vggt_motion.config import BusConfig
+from vggt_motion.errors import BusUnavailableError
+
+LONG = bytes(range(256)) * 400
+pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="no memory as a file system here")
+
+
+@pytest.fixture
+def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in place of that of the machine."""
+    monkeypatch.setattr(parcels, "_MEMORY", tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def sides(memory: Path) -> Iterator[tuple[MemoryParcels, MemoryParcels]]:
+    folder = memory / "vggt_motion-0-session"
+    pair = MemoryParcels(folder), MemoryParcels(folder)
+    yield pair
+    for side in pair:
+        side.close()
+    assert not folder.exists(), "the folder goes with the last one"
+
+
+def left_in(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path.suffix != ".lock"]
+
+
+def test_what_one_side_leaves_the_other_takes(sides: tuple[MemoryParcels, MemoryParcels]) -> None:
+    here, there = sides
+    assert here.is_near(there.greeting) and there.is_near(here.greeting)
+    parcel = here.leave(LONG)
+    assert parcel is not None
+    assert there.is_near(parcel.attachment)
+    assert there.size_bytes(parcel.attachment) == len(LONG)
+    assert there.take(b"", parcel.attachment) == LONG
+    assert there.take(b"", parcel.attachment, is_last_reader=True) == LONG
+    with pytest.raises(BusUnavailableError, match="cannot be read"):
+        there.take(b"", parcel.attachment)
+    parcel.remove()
+
+
+def test_messages_carry_what_is_short_or_comes_without_a_parcel(sides: tuple[MemoryParcels, MemoryParcels]) -> None:
+    here, there = sides
+    assert here.leave(bytes(MIN_PARCEL_BYTES - 1)) is None
+    for attachment in (None, here.greeting):
+        assert there.take(b"payload", attachment) == b"payload"
+        assert there.size_bytes(attachment) == 0
+    assert not there.is_near(None)
+
+
+def test_sides_with_different_folders_are_not_near(memory: Path) -> None:
+    here, there = MemoryParcels(memory / "vggt_motion-0-a"), MemoryParcels(memory / "vggt_motion-0-b")
+    parcel = here.leave(LONG)
+    assert parcel is not None
+    assert not there.is_near(here.greeting) and not there.is_near(parcel.attachment)
+    assert there.take(b"payload", here.greeting) == b"payload"
+    for other in (there, Parcels()):
+        with pytest.raises(BusUnavailableError, match="send it"):
+            other.take(b"", parcel.attachment)
+    here.close()
+    there.close()
+    assert list(memory.iterdir()) == []
+
+
+def test_without_space_nothing_is_left(
+    sides: tuple[MemoryParcels, MemoryParcels], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.statvfs
+
+    class Full:
+        def __init__(self, path: Path) -> None:
+            self.f_frsize = real(path).f_frsize
+            self.f_bavail = 3 * len(LONG) // self.f_frsize - 1
+
+    monkeypatch.setattr(parcels.os, "statvfs", Full)
+    assert sides[0].leave(LONG) is None
+    assert sides[0].leave(LONG[:-8192]) is not None
+
+
+@pytest.mark.parametrize("name", ["fifo", "link", "short", "long", "folder", "missing"])
+def test_what_is_not_the_file_that_was_spoken_of_is_neither_read_nor_waited_for(
+    sides: tuple[MemoryParcels, MemoryParcels], memory: Path, name: str
+) -> None:
+    here = sides[0]
+    folder = memory / "vggt_motion-0-session"
+    os.mkfifo(folder / "fifo")
+    (folder / "target").write_bytes(bytes(100))
+    (folder / "link").symlink_to(folder / "target")
+    (folder / "short").write_bytes(bytes(99))
+    (folder / "long").write_bytes(bytes(101))
+    (folder / "folder").mkdir()
+    attachment = codec.encode(calls.Parcel(codec.decode(calls.Parcel, here.greeting or b"").folder_id, name, 100))
+    with pytest.raises(BusUnavailableError):
+        here.take(b"", attachment)
+    for path in ("fifo", "link", "short", "long", "target"):
+        (folder / path).unlink()
+    (folder / "folder").rmdir()
+
+
+parcels_of_others = st.builds(
+    lambda name, size_bytes: codec.encode(calls.Parcel("0" * 32, name, size_bytes)),
+    st.from_regex("[0-9a-z-]{1,64}", fullmatch=True),
+    st.integers(0, 2**29),
+)
+
+
+@given(attachment=st.binary(max_size=200) | parcels_of_others)
+@settings(max_examples=200, deadline=None)
+def test_any_attachment_gives_the_payload_or_one_clear_refusal(
+    tmp_path_factory: pytest.TempPathFactory, attachment: bytes
+) -> None:
+    side = MemoryParcels(tmp_path_factory.mktemp("memory") / "vggt_motion-0-fuzz")
+    assert not side.is_near(attachment)
+    if side.size_bytes(attachment):
+        with pytest.raises(BusUnavailableError, match=r"\A[^\n]+\Z"):
+            side.take(b"payload", attachment)
+    else:
+        assert side.take(b"payload", attachment) == b"payload"
+    side.close()
+
+
+def test_answers_that_nobody_takes_are_removed_after_a_while(
+    sides: tuple[MemoryParcels, MemoryParcels], memory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = memory / "vggt_motion-0-session"
+    first = sides[0].leave_answer(LONG)
+    assert first is not None
+    sides[0].leave_answer(LONG)
+    assert len(left_in(folder)) == 2
+    monkeypatch.setattr(parcels.time, "monotonic", lambda: first.ends_s + 1.0)
+    third = sides[0].leave_answer(LONG)
+    assert third is not None and left_in(folder) == [codec.decode(calls.Parcel, third.attachment).name]
+    sides[0].close()
+    assert left_in(folder) == []
+
+
+def test_what_a_killed_process_left_is_cleared_up_by_the_next_one(memory: Path) -> None:
+    folder = memory / "vggt_motion-0-session"
+    code = f"""
+import os, signal, sys
+from pathlib import Path
+from vggt_motion.bus.parcels import MemoryParcels
+side = MemoryParcels(Path({str(folder)!r}))
+assert side.leave(bytes(100_000)) is not None
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    alive = MemoryParcels(folder)
+    kept = alive.leave(LONG)
+    assert kept is not None
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    assert len(left_in(folder)) == 2
+    elsewhere = MemoryParcels(memory / "vggt_motion-0-other")
+    assert left_in(folder) == [codec.decode(calls.Parcel, kept.attachment).name]
+    elsewhere.close()
+    alive.close()
+    assert list(memory.iterdir()) == []
+
+
+def test_a_folder_that_others_may_open_is_not_used(memory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    config = BusConfig()
+    opened = open_parcels(config)
+    assert isinstance(opened, MemoryParcels)
+    (folder,) = memory.iterdir()
+    opened.close()
+    folder.mkdir(mode=0o755)
+    folder.chmod(0o755)
+    assert type(open_parcels(config)) is Parcels
+    assert "are sent to processes of this machine too" in caplog.text
+    folder.rmdir()
+    folder.symlink_to(memory)
+    assert type(open_parcels(config)) is Parcels
+    folder.unlink()
+    assert type(open_parcels(config.model_copy(update={"local_parcels": False}))) is Parcels
+    assert list(memory.iterdir()) == []
+
+
+def test_sessions_and_endpoints_have_folders_of_their_own(memory: Path) -> None:
+    configs = [BusConfig(), BusConfig(session="other"), BusConfig(endpoint="tcp/127.0.0.1:7448")]
+    opened = [open_parcels(config) for config in [*configs, configs[0]]]
+    assert len(list(memory.iterdir())) == 3
+    assert [opened[0].is_near(other.greeting) for other in opened] == [True, False, False, True]
+    for side in opened:
+        side.close()
+    assert list(memory.iterdir()) == []
