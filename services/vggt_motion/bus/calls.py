@@ -34,7 +34,7 @@ class AppendRequest:
     payload_type: str  # full name of the message in ``payload``
     payload: bytes
     identity_sha256: bytes  # equal for two payloads if and only if they are the same record
-    blobs: tuple[bytes, ...] = ()
+    blobs: tuple[bytes | memoryview, ...] = ()
     blob_refs: tuple[BlobRef, ...] = ()  # everything that the record refers to; each in ``blobs`` or stored already
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final, TypeAlias, TypeVar
 
 from google.protobuf.message import DecodeError, EncodeError, Message
 
+from vggt_motion.bus.bulk import LIFTED_FROM_BYTES, lift
 from vggt_motion.bus.contract.calls import CALL_PLANS
 from vggt_motion.bus.contract.records import RECORD_PLANS
 from vggt_motion.bus.contract.values import MAX_BLOB_BYTES
@@ -90,12 +91,17 @@ def encode_with_identity(record: Any) -> tuple[bytes, bytes]:
 def decode(cls: type[_Message], payload: bytes) -> _Message:
     """Parse and check a record or call; the inverse of :func:`encode`.
 
+    The blobs of a long request are views of ``payload``, not copies.
+
     Raises:
         CodecError: one line that names the type and the field that is wrong.
     """
     plan = _plan_of(cls)
     _bounded(payload, plan)
     check_structure(payload, plan.message.DESCRIPTOR)
+    lifted = None
+    if plan.has_bulk and len(payload) >= LIFTED_FROM_BYTES:
+        payload, lifted = lift(payload, plan)
     message = plan.message()
     try:
         message.ParseFromString(payload)
@@ -107,7 +113,7 @@ def decode(cls: type[_Message], payload: bytes) -> _Message:
             problem = "is missing" if version == 0 else f"{version} is newer than the known {SCHEMA_VERSION}"
             raise CodecError(f"{plan.full_name}: schema_version {problem}")
     try:
-        record: _Message = plan.read(message)
+        record: _Message = plan.read(message, lifted)
     except FieldError as error:
         raise _codec_error(plan, error) from None
     return record

@@ -82,7 +82,7 @@ def encode_depth(depth: npt.NDArray[np.floating], confidence: npt.NDArray[np.flo
     return b"".join((header, _CHECKED.pack(zlib.crc32(header)), compressor.compress(raw.data)))
 
 
-def decode_depth(payload: bytes) -> tuple[Depth, Depth]:
+def decode_depth(payload: bytes | memoryview) -> tuple[Depth, Depth]:
     """Decode a depth blob; the inverse of :func:`encode_depth`.
 
     Never allocates more than the header declares, and the header cannot declare more than ``MAX_PIXELS``.
@@ -126,7 +126,7 @@ def _check_size(width: int, height: int) -> None:
         raise CodecError(f"depth blob: size {width} x {height} px is out of range")
 
 
-def _decompress(frame: bytes, expected_bytes: int) -> bytes:
+def _decompress(frame: bytes | memoryview, expected_bytes: int) -> bytes:
     try:
         if zstandard.get_frame_parameters(frame).content_size != expected_bytes:
             raise CodecError("depth blob: content has another size than the header declares")

@@ -62,6 +62,10 @@ class Rule:
         """The field as it stands on the wire under this number, in pieces, without a copy of what is long."""
         raise NotImplementedError
 
+    def take_lifted(self, message: Message, name: str, contents: tuple[memoryview, ...]) -> Any:
+        """Read a field whose contents were taken out of the message before."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class Text(Rule):
@@ -153,14 +157,14 @@ class Raw(Rule):
     min_bytes: int = 0
 
     def check(self, value: Any) -> Any:
-        if not isinstance(value, bytes):
+        if not isinstance(value, (bytes, memoryview)):
             raise FieldError(f"must be bytes, not {type(value).__name__}")
         if not self.min_bytes <= len(value) <= self.max_bytes:
             raise FieldError(f"has {len(value)} bytes, allowed are {self.min_bytes} to {self.max_bytes}")
         return value
 
     def pieces(self, number: int, value: Any) -> list[bytes]:
-        return [_delimited(number, len(self.check(value))), value]
+        return [delimited(number, len(self.check(value))), value]
 
 
 class Choice(Rule):
@@ -237,9 +241,14 @@ class Sub(Rule):
                 raise error.at(f"[{index}]") from None
         return out
 
+    def take_lifted(self, message: Message, name: str, contents: tuple[memoryview, ...]) -> Any:
+        if not message.HasField(name):
+            raise FieldError("is missing")
+        return self.plan.read(getattr(message, name), contents)
+
     def pieces(self, number: int, value: Any) -> list[bytes]:
         inner = self.plan.pieces(value, self.plan.message())
-        return [_delimited(number, sum(map(len, inner))), *inner]
+        return [delimited(number, sum(map(len, inner))), *inner]
 
 
 @dataclass(frozen=True)
@@ -278,6 +287,10 @@ class Many(Rule):
         container = getattr(message, name)
         self._check_count(len(container))
         return tuple(self.rule.collect(container))
+
+    def take_lifted(self, message: Message, name: str, contents: tuple[memoryview, ...]) -> Any:
+        self._check_count(len(contents))
+        return tuple(self.rule.collect(contents))
 
     def pieces(self, number: int, value: Any) -> list[bytes]:
         if not isinstance(value, tuple):
@@ -365,7 +378,8 @@ class Plan:
             rules: one for each field of ``record``.
             test: looks at the whole record and returns what is wrong with it, or None.
             informative: fields that are not part of the record's identity.
-            bulk: the field that may hold megabytes: it comes last on the wire, copied once.
+            bulk: the field that may hold megabytes: it comes last on the wire, copied once on the way out and not at
+                all on the way in.
             max_bytes: longest encoded message that is decoded at all.
         """
         names = {entry.name for entry in fields(record)}
@@ -383,16 +397,25 @@ class Plan:
         self._test = test
         self.has_bulk = bulk is not None
 
+    @property
+    def bulk_field(self) -> tuple[int, Rule]:
+        """Number and rule of the bulk field."""
+        ((_, number, rule),) = self._tail
+        return number, rule
+
     def fill(self, message: Message, record: Any) -> None:
         """Move a record into an empty message."""
         self._fill(message, record, self._rules)
 
-    def read(self, message: Message) -> Any:
-        """Make the record of a message."""
+    def read(self, message: Message, lifted: tuple[memoryview, ...] | None = None) -> Any:
+        """Make the record of a message; ``lifted`` is what its bulk field held."""
         values = {}
         for name, rule in self._rules:
             try:
-                values[name] = rule.take(message, name)
+                if lifted is not None and name == self._tail[0][0]:
+                    values[name] = rule.take_lifted(message, name, lifted)
+                else:
+                    values[name] = rule.take(message, name)
             except FieldError as error:
                 raise error.at(name) from None
         record = self.record(**values)
@@ -431,7 +454,7 @@ class Plan:
             raise FieldError(problem)
 
 
-def _delimited(number: int, length: int) -> bytes:
+def delimited(number: int, length: int) -> bytes:
     """Tag and length of a field that is delimited by its length (protobuf, "Encoding")."""
     out = bytearray()
     for value in (number << 3 | 2, length):

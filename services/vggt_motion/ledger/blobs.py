@@ -21,6 +21,7 @@ from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, free_
 from vggt_motion.ledger.store import (
     Blob,
     BlobEntry,
+    Content,
     DamagedBlobError,
     InvalidRequestError,
     UnknownError,
@@ -69,7 +70,7 @@ class BlobFiles:
         except OSError as error:
             raise LedgerError(f"cannot use {folder} for blobs: {error.strerror or error}") from error
 
-    def put(self, blobs: Sequence[bytes | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
+    def put(self, blobs: Sequence[Content | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
         """Make blobs durable, in order; see :meth:`.store.Blobs.put`."""
         hashed = [Blob.of(data) for data in blobs]
         # An existing file is read again: that its name is there does not say that the disk kept its content.
@@ -171,7 +172,7 @@ class BlobFiles:
         except OSError:
             return False
 
-    def _write(self, sha256: str, data: bytes) -> None:
+    def _write(self, sha256: str, data: Content) -> None:
         target = self._path(sha256)
         temporary = self._incoming / f"{sha256}.{next(self._counter)}"
         try:

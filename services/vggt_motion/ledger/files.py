@@ -18,7 +18,7 @@ _MAX_PIECES = 512  # in one call; the least that systems allow is 16, Linux allo
 class FileOperations:
     """The file operations that durability rests on, apart so that tests can record them and let them fail."""
 
-    def write_and_sync(self, path: Path, data: bytes) -> None:
+    def write_and_sync(self, path: Path, data: bytes | memoryview) -> None:
         """Create a file with this content and force it to the disk."""
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
@@ -29,7 +29,7 @@ class FileOperations:
         finally:
             os.close(descriptor)
 
-    def write_at(self, path: Path, descriptor: int, offset_bytes: int, pieces: Sequence[bytes]) -> None:
+    def write_at(self, path: Path, descriptor: int, offset_bytes: int, pieces: Sequence[bytes | memoryview]) -> None:
         """Write pieces one behind the other into the open file ``path``; not durable yet."""
         views = [memoryview(piece) for piece in pieces if piece]
         while views:

@@ -24,6 +24,7 @@ from vggt_motion.ledger.store import (
     Blob,
     BlobEntry,
     ConflictError,
+    Content,
     InvalidRequestError,
     JobRow,
     LeaseRow,
@@ -216,7 +217,7 @@ class JobQueue:
         job_id: str,
         lease_id: str,
         record: NewRecord,
-        blobs: Sequence[bytes | Blob] = (),
+        blobs: Sequence[Content | Blob] = (),
         references: Sequence[BlobEntry] = (),
     ) -> Done:
         """Append the result of a job and make the job done, in one transaction.

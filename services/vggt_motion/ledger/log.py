@@ -21,6 +21,7 @@ from vggt_motion.ledger.store import (
     BlobEntry,
     Blobs,
     ConflictError,
+    Content,
     DamagedBlobError,
     InvalidRequestError,
     NewRecord,
@@ -54,7 +55,7 @@ class Append(NamedTuple):
     """A record that is to become durable."""
 
     record: NewRecord
-    blobs: Sequence[bytes | Blob] = ()  # new ones, that travel with it
+    blobs: Sequence[Content | Blob] = ()  # new ones, that travel with it
     references: Sequence[BlobEntry] = ()  # what it refers to; each among ``blobs`` or stored already
 
 
@@ -81,7 +82,7 @@ class _Needs(NamedTuple):
     """What has to become durable before the row of a record."""
 
     entries: tuple[BlobEntry, ...]
-    small: dict[BlobEntry, bytes]
+    small: dict[BlobEntry, Content]
     large: list[Blob]
     keep_free_bytes: int
 
@@ -129,7 +130,7 @@ class Store:
         self._time_ns = time_ns
 
     def append(
-        self, record: NewRecord, blobs: Sequence[bytes | Blob] = (), references: Sequence[BlobEntry] = ()
+        self, record: NewRecord, blobs: Sequence[Content | Blob] = (), references: Sequence[BlobEntry] = ()
     ) -> Appended:
         """Make a record durable, with its blobs.
 
@@ -192,7 +193,7 @@ class Store:
             return None
         return Appended(known.sequence, was_known=True)
 
-    def prepare(self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> Prepared:
+    def prepare(self, blobs: Sequence[Content | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> Prepared:
         """Make the blobs of a record durable, before its row, and see that every blob will be there.
 
         Raises:
@@ -205,7 +206,7 @@ class Store:
             raise outcome
         return outcome
 
-    def _needs(self, blobs: Sequence[bytes | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> _Needs:
+    def _needs(self, blobs: Sequence[Content | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> _Needs:
         """What :meth:`prepare` has to do, after it was checked."""
         if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
             raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")
@@ -256,7 +257,7 @@ class Store:
             outcomes.append(Prepared(needs.entries, places))
         return outcomes
 
-    def _not_kept(self, small: dict[BlobEntry, bytes]) -> dict[BlobEntry, bytes]:
+    def _not_kept(self, small: dict[BlobEntry, Content]) -> dict[BlobEntry, Content]:
         """Those that are not in a pack yet, or damaged there: then they come back so."""
         if not small:
             return small
@@ -267,7 +268,7 @@ class Store:
             )
         )
 
-        def is_kept(entry: BlobEntry, data: bytes) -> bool:
+        def is_kept(entry: BlobEntry, data: Content) -> bool:
             place = places[entry]
             return data == (contents[entry] if place is None else self._packs.read(place))
 

@@ -19,7 +19,7 @@ from typing import Final
 
 from vggt_motion.errors import DiskFullError, LedgerError
 from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, make_folder
-from vggt_motion.ledger.store import Place
+from vggt_motion.ledger.store import Content, Place
 
 _LOGGER = logging.getLogger(__name__)
 _NAME = re.compile(r"(\d{8})\.pack")
@@ -53,7 +53,7 @@ class PackFiles:
         except OSError as error:
             raise LedgerError(f"cannot use {folder} for packs: {error.strerror or error}") from error
 
-    def append(self, contents: Sequence[bytes]) -> list[Place]:
+    def append(self, contents: Sequence[Content]) -> list[Place]:
         """Make contents durable, in order, under one sync; other callers at the same time share it.
 
         Raises:
@@ -164,7 +164,7 @@ class _Pack:
         self._is_named = False  # also if it is there: a process that was killed may not have come to its name
         self._shared_sync = SharedSync(self._force)
 
-    def write(self, contents: Sequence[bytes]) -> int:
+    def write(self, contents: Sequence[Content]) -> int:
         """Put contents behind what is there, not durable yet; returns where they begin. One caller at a time."""
         begin = self.end
         try:

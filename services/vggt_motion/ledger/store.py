@@ -13,12 +13,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 from vggt_motion.errors import RefusalCode, RequestRefusedError
 from vggt_motion.records import JobState
 
 T = TypeVar("T")
+Content: TypeAlias = bytes | memoryview
+"""Of a blob; a view is into the request that it came with."""
 
 
 class InvalidRequestError(RequestRefusedError):
@@ -65,10 +67,10 @@ class Blob:
     """Bytes with their hash, so that it is computed once on their way through the ledger."""
 
     entry: BlobEntry
-    data: bytes = field(repr=False)
+    data: Content = field(repr=False)
 
     @classmethod
-    def of(cls, data: bytes | Blob) -> Blob:
+    def of(cls, data: Content | Blob) -> Blob:
         """Bytes, hashed if they are not yet."""
         if isinstance(data, Blob):
             return data
@@ -274,7 +276,7 @@ class Rows(Protocol):
 class Blobs(Protocol):
     """Durable bytes, addressed by their SHA-256: those that are too large to stand among the rows."""
 
-    def put(self, blobs: Sequence[bytes | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
+    def put(self, blobs: Sequence[Content | Blob], *, keep_free_bytes: int) -> list[BlobEntry]:
         """Make blobs durable, in order; durable on return. Known ones are not stored twice.
 
         Raises:
@@ -302,7 +304,7 @@ class Blobs(Protocol):
 class Packs(Protocol):
     """Durable bytes at places that the rows know: those that are too small for a file of their own."""
 
-    def append(self, contents: Sequence[bytes]) -> list[Place]:
+    def append(self, contents: Sequence[Content]) -> list[Place]:
         """Make contents durable, in order; durable on return, under one sync.
 
         Raises:
@@ -313,7 +315,7 @@ class Packs(Protocol):
         """What lies at a place; not verified."""
 
 
-def sha256_hex(data: bytes) -> str:
+def sha256_hex(data: Content) -> str:
     """SHA-256 as 64 lower-case hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
