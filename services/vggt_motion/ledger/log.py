@@ -158,11 +158,14 @@ class Store:
         """
         outcomes: dict[int, Appended | Exception] = {}
         needed: dict[int, _Needs] = {}
+        known = self._known(wanted)
         for index, entry in enumerate(wanted):
+            row = known.get(index)
             try:
-                known = self._known(entry)
-                if known is not None:
-                    outcomes[index] = known
+                if isinstance(row, Exception):
+                    raise row
+                if row is not None and self._has_all(row.stream, row.sequence):
+                    outcomes[index] = Appended(row.sequence, was_known=True)
                     continue
                 is_input = entry.record.stream in self._input_streams
                 needed[index] = self._needs(entry.blobs, entry.references, is_input=is_input)
@@ -183,15 +186,39 @@ class Store:
         outcomes |= zip(changes, written, strict=True)
         return [outcomes[index] for index in range(len(wanted))]
 
-    def _known(self, entry: Append) -> Appended | None:
-        """The acknowledgement of a record that is there already, before blobs are written or space is asked for."""
-        check_record(entry.record)
-        if not entry.blobs and self.is_accepting:
-            return None  # the commit looks anyway
-        known = self._rows.read(lambda reader: self._find_known(reader, entry.record))
-        if known is None or not self._has_all(known.stream, known.sequence):
-            return None
-        return Appended(known.sequence, was_known=True)
+    def _known(self, wanted: Sequence[Append]) -> dict[int, RecordRow | VggtMotionError]:
+        """The rows of those that are there already, before blobs are written or space is asked for; or what is wrong.
+
+        Those without blobs are not looked for while there is space: the commit does it.
+        """
+        found: dict[int, RecordRow | VggtMotionError] = {}
+        asked: list[int] = []
+        is_accepting = self.is_accepting
+        for index, entry in enumerate(wanted):
+            try:
+                check_record(entry.record)
+            except InvalidRequestError as error:
+                found[index] = error
+                continue
+            if entry.blobs or not is_accepting:
+                asked.append(index)
+
+        def look(reader: Reader) -> dict[int, RecordRow | VggtMotionError]:
+            seen: dict[int, RecordRow | VggtMotionError] = {}
+            for index in asked:
+                try:
+                    row = self._find_known(reader, wanted[index].record)
+                except ConflictError as error:
+                    seen[index] = error
+                    continue
+                if row is not None:
+                    seen[index] = row
+            return seen
+
+        try:
+            return found | (self._rows.read(look) if asked else {})
+        except VggtMotionError as error:
+            return found | dict.fromkeys(asked, error)
 
     def prepare(self, blobs: Sequence[Content | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> Prepared:
         """Make the blobs of a record durable, before its row, and see that every blob will be there.
@@ -294,7 +321,12 @@ class Store:
             append_time_ns=time_ns,
             row_sha256=row_digest(record, sequence, time_ns),
         )
-        transaction.add_record(row, prepared.entries)
+        transaction.add_record(row)
+        placed = {entry for entry, _ in prepared.places}
+        for entry in prepared.entries:
+            if entry not in placed:
+                transaction.add_blob(entry)
+            transaction.add_reference(record.stream, sequence, entry.sha256)
         return Appended(sequence, was_known=False)
 
     def read(self, stream: str, from_sequence: int = 0, limit: int = 0) -> list[RecordRow]:

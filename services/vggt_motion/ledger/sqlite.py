@@ -143,27 +143,23 @@ class _Statements:
         return [_job(row) for row in self._all(statement + " ORDER BY job_id LIMIT ?", *values, limit)]
 
     def next_sequence(self, stream: str) -> int:
-        self._run(
-            """INSERT INTO streams (stream, next_sequence) VALUES (?, 1)
-            ON CONFLICT (stream) DO UPDATE SET next_sequence = streams.next_sequence + 1""",
-            stream,
-        )
-        return int(self._value("SELECT next_sequence FROM streams WHERE stream = ?", stream)) - 1
+        statement = """INSERT INTO streams (stream, next_sequence) VALUES (?, 1)
+            ON CONFLICT (stream) DO UPDATE SET next_sequence = streams.next_sequence + 1 RETURNING next_sequence"""
+        ((next_sequence,),) = self._all(statement, stream)
+        return int(next_sequence) - 1
 
-    def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
+    def add_record(self, row: RecordRow) -> None:
         self._run(_ADD_RECORD, *_record_values(row))
-        for blob in sorted(set(blobs), key=lambda blob: blob.sha256):
-            self._run(
-                "INSERT INTO blobs (sha256, size_bytes) VALUES (?, ?) ON CONFLICT (sha256) DO NOTHING",
-                blob.sha256,
-                blob.size_bytes,
-            )
-            self._run(
-                "INSERT INTO record_blobs (stream, sequence, sha256) VALUES (?, ?, ?)",
-                row.stream,
-                row.sequence,
-                blob.sha256,
-            )
+
+    def add_reference(self, stream: str, sequence: int, sha256: str) -> None:
+        self._run("INSERT INTO record_blobs (stream, sequence, sha256) VALUES (?, ?, ?)", stream, sequence, sha256)
+
+    def add_blob(self, entry: BlobEntry) -> None:
+        self._run(
+            "INSERT INTO blobs (sha256, size_bytes) VALUES (?, ?) ON CONFLICT (sha256) DO NOTHING",
+            entry.sha256,
+            entry.size_bytes,
+        )
 
     def set_place(self, entry: BlobEntry, place: Place) -> None:
         self._run(

@@ -210,8 +210,14 @@ class Transaction(Reader, Protocol):
     def next_sequence(self, stream: str) -> int:
         """The next sequence number of a stream, taken: it is used up if and only if the change commits."""
 
-    def add_record(self, row: RecordRow, blobs: Sequence[BlobEntry]) -> None:
-        """Insert a record and its references to blobs, whose contents are durable already."""
+    def add_record(self, row: RecordRow) -> None:
+        """Insert a record."""
+
+    def add_reference(self, stream: str, sequence: int, sha256: str) -> None:
+        """Say that a record refers to a blob; both are there."""
+
+    def add_blob(self, entry: BlobEntry) -> None:
+        """Insert a blob whose content is durable, unless it is known."""
 
     def set_place(self, entry: BlobEntry, place: Place) -> None:
         """Insert a blob that lies in a pack, or say where it lies now."""
