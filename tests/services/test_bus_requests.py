@@ -170,13 +170,13 @@ def test_a_batch_ends_before_it_grows_too_large_and_a_defect_refuses_all_of_it(e
         key = server.keys.rpc("test", "together")
         served = server.serve_together(key, handler, at_a_time=64)
         with ThreadPoolExecutor(8) as pool:
-            asked = [pool.submit(client.request, key, bytes(3 * 2**20)) for _ in range(6)]
+            asked = [pool.submit(client.request, key, bytes(12 * 2**20)) for _ in range(6)]
             wait_until(lambda: len(served._waiting) == 5)  # type: ignore[attr-defined]
             release.set()
             for future in asked:
                 with pytest.raises(RequestRefusedError, match="internal error: ValueError"):
                     future.result(30)
-    assert sum(batches) == 18 * 2**20 and max(batches) <= 8 * 2**20
+    assert sum(batches) == 72 * 2**20 and max(batches) <= 32 * 2**20
 
 
 def test_a_wildcard_request_is_refused(endpoint: str) -> None:
