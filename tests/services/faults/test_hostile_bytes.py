@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import random
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from synthetic_session import Session
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.images import ImageHeader, decode_image, encode_image
 from vggt_motion.bus.ledger import append_request
+from vggt_motion.bus.parcels import _identity
+from vggt_motion.bus.session import Bus
 from vggt_motion.errors import CodecError, RequestRefusedError
 from vggt_motion.ledger.admission import admitted
 from vggt_motion.records import HealthReport, JobKind, Stream
@@ -54,6 +58,13 @@ def _append_entry(payload: bytes) -> None:
     admitted(codec.decode(calls.AppendRequest, payload))
 
 
+def _long_append_entry(payload: bytes) -> None:
+    """As the blobs of a long request are read: as views."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "LIFTED_FROM_BYTES", 0)
+        _append_entry(payload)
+
+
 def _done_entry(payload: bytes) -> None:
     admitted(codec.decode(calls.DoneRequest, payload).result)
 
@@ -61,6 +72,11 @@ def _done_entry(payload: bytes) -> None:
 ENTRIES: dict[str, tuple[Callable[[bytes], Any], list[bytes]]] = {
     "append": (_append_entry, [codec.encode(request) for request in APPENDS]),
     "done": (_done_entry, [codec.encode(calls.DoneRequest("job", "lease", request)) for request in RESULTS]),
+    "long append": (_long_append_entry, [codec.encode(request) for request in APPENDS]),
+    "parcel": (
+        lambda payload: codec.decode(calls.Parcel, payload),
+        [codec.encode(calls.Parcel("0123456789abcdef" * 2, "0123456789abcdef-7", 100_000))],
+    ),
     "claim": (
         lambda payload: codec.decode(calls.ClaimRequest, payload),
         [codec.encode(calls.ClaimRequest((JobKind.PREDICT,), ("sfm",), "inference/1", 0.0, "claim"))],
@@ -190,6 +206,12 @@ def test_hostile_bytes_through_a_live_session(tmp_path: Path, sample_dir: Path, 
                 assert "\n" not in str(caught.value)
                 refused += 1
         assert refused >= 3 * LIVE_CASES
+        with _foreign_parcels(session.bus, tmp_path) as foreign:
+            for attachment in (*_cases("parcel", generator), *foreign):
+                asked: Any = session.bus._session.get(
+                    keys.rpc("ledger", "append"), payload=b"", attachment=attachment, timeout=10.0
+                )
+                assert asked.recv().err is not None
         cases = _cases("image", generator)
         for payload in cases:
             camera.put(payload, attachment=generator.choice([b"", b"\xff" * 9, ImageHeader(0, 11).encode()]))
@@ -208,6 +230,23 @@ def test_hostile_bytes_through_a_live_session(tmp_path: Path, sample_dir: Path, 
         other = keys.rpc("ledger", "append").replace("/test/", "/other/")
         with pytest.raises(Exception, match="nobody answers"):
             session.bus.request(other, b"")
+
+
+@contextlib.contextmanager
+def _foreign_parcels(bus: Bus, tmp_path: Path) -> Iterator[list[bytes]]:
+    """Attachments that name what is there, but is no parcel, or not of this length; and what is not there."""
+    if bus._parcels.greeting is None:
+        yield []
+        return
+    folder_id = codec.decode(calls.Parcel, bus._parcels.greeting).folder_id
+    folder = next(path for path in Path("/dev/shm").glob("vggt_motion-*") if _identity(path) == folder_id)
+    (folder / "link").symlink_to(tmp_path / "ledger" / "ledger.db")
+    os.mkfifo(folder / "pipe")
+    (folder / "short").write_bytes(b"short")
+    named = [calls.Parcel(folder_id, name, 2**20) for name in ("link", "pipe", "short", "nothing")]
+    yield [codec.encode(parcel) for parcel in (*named, calls.Parcel("0" * 32, "short", 5))]
+    for name in ("link", "pipe", "short"):
+        (folder / name).unlink()
 
 
 def _refused_frames(report: HealthReport | None) -> float:
