@@ -5,7 +5,7 @@ for a whole record. A recording whose process was killed has neither an end nor 
 framing is checked here, record by record: a record counts only if every byte of it is there, and a chunk only if its
 checksum holds. Everything before the first damage is delivered; nothing after it is guessed at.
 
-Format: https://mcap.dev/spec (records are opcode, length, content; messages sit in compressed chunks).
+Format: https://mcap.dev/spec (records are opcode, length, content; messages sit in chunks).
 """
 
 from __future__ import annotations
