@@ -15,7 +15,9 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
 
 from vggt_motion.errors import InputError, SourceError, SourceTruncatedError
 from vggt_motion.foxglove import (
@@ -27,7 +29,7 @@ from vggt_motion.foxglove import (
     poses_in_frame,
 )
 from vggt_motion.geometry import se3
-from vggt_motion.recorder import schemas
+from vggt_motion.recorder import record, schemas
 from vggt_motion.recorder.container import McapScanner
 from vggt_motion.recorder.indexset import IndexSet
 from vggt_motion.recorder.payloads import RecentPayloads
@@ -306,6 +308,27 @@ def test_hostile_chunks_are_refused_before_memory_is_spent(tmp_path: Path) -> No
         scanner = McapScanner(path)
         assert list(scanner.messages()) == []
         assert scanner.damage is not None
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
+def test_compressed_recordings_are_read_and_continued_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType
+) -> None:
+    path = tmp_path / "run.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            record, "Writer", lambda *args, **options: Writer(*args, **{**options, "compression": compression})
+        )
+        with Recording.open(path, chunk_bytes=3000) as recording:
+            for index in range(4):
+                recording.add_frame(FrameId("front", 0, index), frame(index))
+    with path.open("rb") as file:
+        chunks = [entry for entry in StreamReader(file, emit_chunks=True).records if isinstance(entry, Chunk)]
+    assert {chunk.compression for chunk in chunks} == {"" if compression is CompressionType.NONE else "zstd"}
+    assert list(open_source(str(path)).frames()) == [frame(index) for index in range(4)]
+    with Recording.open(path, chunk_bytes=3000) as recording:
+        recording.add_frame(FrameId("front", 0, 4), frame(4))
+    assert list(open_source(str(path)).frames()) == [frame(index) for index in range(5)]
 
 
 def test_source_needs_an_mcap_file_with_images(tmp_path: Path) -> None:

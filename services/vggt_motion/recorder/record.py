@@ -324,7 +324,7 @@ class Recording:
         self._writer = Writer(
             self._file,
             chunk_size=self._chunk_bytes,
-            # Frames and payloads are compressed already: zstd took 2 % off, in more time than checksums and copies take.
+            # Frames and payloads are compressed already: zstd took 2 % off, for more time than checksums and copies.
             compression=CompressionType.NONE,
             index_types=IndexType.CHUNK | IndexType.MESSAGE,
         )
