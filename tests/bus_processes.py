@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,12 +27,21 @@ _log = logging.getLogger(__name__)
 SESSION = "test"
 READY_S = 20.0
 THIS = Path(__file__)
+_kept_ports: deque[socket.socket] = deque(maxlen=64)  # many more than one test asks for
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port that stays the test's own, also while nobody listens on it: before its router starts, and between two.
+
+    The socket remains bound and never listens. A listener that sets SO_REUSEADDR, as Zenoh's and ours do, may join it;
+    but the system gives the port to nobody who asks for any, nor to the near end of a connection, which could otherwise
+    even be made to itself by whoever tries to reach a router that is not there yet.
+    """
+    keeper = socket.socket()
+    keeper.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    keeper.bind(("127.0.0.1", 0))
+    _kept_ports.append(keeper)
+    return int(keeper.getsockname()[1])
 
 
 def bus_config(endpoint: str, **changes: float) -> BusConfig:

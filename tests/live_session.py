@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from bus_processes import free_port
 from synthetic_session import Session
 from vggt_motion.bus import codec
 from vggt_motion.bus.ledger import LedgerClient
@@ -23,12 +23,6 @@ from vggt_motion.errors import BusUnavailableError
 from vggt_motion.records import HealthReport
 
 PATIENCE_S = 60.0
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_for(condition: Callable[[], Any], what: str = "it", timeout_s: float = PATIENCE_S) -> Any:
