@@ -18,7 +18,8 @@ from pathlib import Path
 from vggt_motion.bus import calls, codec, router
 from vggt_motion.bus.keys import last_chunk
 from vggt_motion.bus.service import ServiceContext, run_service
-from vggt_motion.bus.session import Bus, open_bus
+from vggt_motion.bus.serving import Handler
+from vggt_motion.bus.session import Bus, Closable, open_bus
 from vggt_motion.config import BusConfig, Config
 from vggt_motion.errors import BusUnavailableError, DiskFullError, RefusalCode, RequestRefusedError
 from vggt_motion.records import Event, EventKind, LogEntry
@@ -109,6 +110,51 @@ def wait_until(condition: object, timeout_s: float = READY_S) -> None:
         time.sleep(0.02)
 
 
+# --- knowing of each other -------------------------------------------------------------------------------------------
+# A declaration takes a moment to travel to the router and on to the others. A request that comes before it finds
+# nobody, and what is published before it is dropped: services repeat and read what they lack, a test has to wait.
+def wait_until_served(asker: Bus, *keys: str) -> None:
+    """Return when requests from a session reach somebody who serves the keys."""
+    for key in keys:
+        querier = asker._session.declare_querier(key)
+        wait_until(lambda querier=querier: querier.matching_status.matching)
+        querier.undeclare()
+
+
+def serve(server: Bus, key: str, handler: Handler, *, asker: Bus, threads: int = 1) -> Closable:
+    """Serve a key, and return when requests of another session are answered."""
+    served = server.serve(key, handler, threads=threads)
+    wait_until_served(asker, key)
+    return served
+
+
+def wait_until_heard(sender: Bus, key: str) -> None:
+    """Return when what a session publishes on a key reaches a subscriber."""
+    _wait_until_subscribed(sender, key, wanted=True)
+
+
+def wait_until_unheard(sender: Bus, key: str) -> None:
+    """Return when a session knows that nobody subscribes to a key any more, so that it can wait for the next one."""
+    _wait_until_subscribed(sender, key, wanted=False)
+
+
+def _wait_until_subscribed(sender: Bus, key: str, *, wanted: bool) -> None:
+    # A publisher beside the test's own: one with a history does not tell, and what a session knows is true for both.
+    probe = sender._session.declare_publisher(key)
+    wait_until(lambda: probe.matching_status.matching is wanted)
+    probe.undeclare()
+
+
+def wait_until_known(bus: Bus) -> None:
+    """Return when the router knows all that a session has declared, and has all that it has published."""
+    # The router takes messages of one link in turn: what came before this request has been dealt with.
+    try:
+        bus.request(bus.keys.rpc("test", "nobody_serves_this"), b"")
+    except BusUnavailableError as error:
+        if "nobody answers" not in str(error):
+            raise
+
+
 # --- roles -----------------------------------------------------------------------------------------------------------
 def answer(context: ServiceContext) -> None:
     """Answers on @rpc/test/*: what the bus promises to carry."""
@@ -129,9 +175,10 @@ def answer(context: ServiceContext) -> None:
                 return b"late"
         raise RequestRefusedError("unknown call", RefusalCode.UNKNOWN)
 
-    for call in ("echo", "conflict", "full", "defect"):
-        context.bus.serve(context.bus.keys.rpc("test", call), handler)
+    # Declarations arrive in order: whoever hears the echo finds the others too.
     context.bus.serve(context.bus.keys.rpc("test", "slow"), handler, threads=2)
+    for call in ("conflict", "full", "defect", "echo"):
+        context.bus.serve(context.bus.keys.rpc("test", call), handler)
     context.set_health("working", "answering", requests=1.0)
     context.stopping.wait()
 
