@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bus_processes import READY_S, SESSION, connect, free_port, wait_until
+from bus_processes import READY_S, SESSION, connect, free_port, wait_until, wait_until_served
 from vggt_motion.bus import codec, router
 from vggt_motion.bus.jobs import JobClient
 from vggt_motion.bus.ledger import LedgerClient
@@ -46,6 +46,27 @@ from vggt_motion.records import (
 )
 
 IMAGE_TYPE = "image/jpeg"
+CALLS = {
+    "ledger": ("append", "read", "status"),
+    "jobs": ("submit", "claim", "heartbeat", "done", "fail", "reports", "cancel"),
+}
+
+
+def wait_until_ledger_is_served(bus: Bus) -> None:
+    """Return when a session reaches every call of a ledger: they are declared one after the other."""
+    client = LedgerClient(bus)
+
+    def is_answered() -> bool:
+        try:
+            client.status()
+        except BusUnavailableError:
+            return False
+        return True
+
+    wait_until(is_answered)
+    wait_until_served(
+        bus, bus.keys.all_blobs(), *(bus.keys.rpc(service, call) for service, calls in CALLS.items() for call in calls)
+    )
 
 
 # --- records ---------------------------------------------------------------------------------------------------------
@@ -163,14 +184,7 @@ class Site:
         return LedgerClient(self.bus).status()
 
     def wait_until_ready(self) -> None:
-        def is_ready() -> bool:
-            try:
-                self.status()
-            except BusUnavailableError:
-                return False
-            return True
-
-        wait_until(is_ready)
+        wait_until_ledger_is_served(self.bus)
 
     def job_state(self, job_id: str) -> str:
         return next(report.state.value for report in self.jobs().reports() if report.job_id == job_id)

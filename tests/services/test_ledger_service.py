@@ -14,6 +14,7 @@ import pytest
 
 from bus_processes import wait_until
 from ledger_processes import (
+    CALLS,
     Site,
     depth_blob,
     event,
@@ -321,11 +322,6 @@ def test_every_job_is_done_once_while_workers_and_ledger_are_killed(tmp_path: Pa
 
 
 # Bad bytes
-
-CALLS = {
-    "ledger": ("append", "read", "status"),
-    "jobs": ("submit", "claim", "heartbeat", "done", "fail", "reports", "cancel"),
-}
 
 
 def hostile_payloads() -> Iterator[tuple[str, str, bytes]]:
