@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 from vggt_motion.bus import calls, codec, router
 from vggt_motion.bus.keys import last_chunk
@@ -239,5 +240,13 @@ def main(arguments: list[str]) -> int:
     raise SystemExit(f"unknown role {role}")
 
 
+def leave(code: int) -> NoReturn:
+    """End as the command does: Zenoh's own threads may abort an interpreter that winds down."""
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(main(sys.argv[1:]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import os
 import signal
 import subprocess
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bus_processes import READY_S, SESSION, connect, free_port, wait_until, wait_until_served
+from bus_processes import READY_S, SESSION, connect, free_port, leave, wait_until, wait_until_served
 from vggt_motion.bus import codec, router
 from vggt_motion.bus.jobs import JobClient
 from vggt_motion.bus.ledger import LedgerClient
@@ -277,8 +276,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    exit_code = main(sys.argv[1:])
-    logging.shutdown()
-    sys.stdout.flush()
-    # What these tests ask is what a service returns; Zenoh's own threads may abort an interpreter that winds down.
-    os._exit(exit_code)
+    leave(main(sys.argv[1:]))
