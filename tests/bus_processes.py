@@ -88,6 +88,12 @@ class Process:
     def text(self) -> str:
         return self.log.read_text()
 
+    def handles(self, number: signal.Signals) -> bool:
+        """Whether it has set a handler for a signal: before that, the system ends it."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        caught = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
+        return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
 
 @contextlib.contextmanager
 def running(folder: Path, role: str, endpoint: str, *arguments: str, script: Path = THIS) -> Iterator[Process]:

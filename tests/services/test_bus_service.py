@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bus_processes import Process, connect, free_port, running, wait_until
+from bus_processes import Process, connect, free_port, running, wait_until, wait_until_heard, wait_until_known
 from vggt_motion.bus.liveliness import ServiceWatch, announce
 from vggt_motion.bus.session import Bus
 from vggt_motion.records import HealthReport
@@ -36,6 +36,9 @@ def test_a_service_shows_itself_and_says_how_it_is(bus: Bus, endpoint: str, tmp_
         assert abs(report.time_ns / 1e9 - time.time()) < 60
         earlier = report.time_ns
         wait_until(lambda: getattr(watch.services()["answer", "one"], "time_ns", 0) > earlier)
+        # Just after a report, so that none is on its way that could overtake the end of the token.
+        last = getattr(watch.services()["answer", "two"], "time_ns", 0)
+        wait_until(lambda: getattr(watch.services()["answer", "two"], "time_ns", 0) > last)
         second.kill()
         wait_until(lambda: ("answer", "two") not in watch.services())
         assert watch.missing({"answer": 2, "ledger": 1}) == {"answer": 1, "ledger": 1}
@@ -79,6 +82,7 @@ def test_health_that_is_no_health_is_passed_over(bus: Bus, endpoint: str) -> Non
         good = HealthReport("frontend", "a", 1, "idle", "", 0)
         announce(other, "frontend", "a", lambda: good)
         liar = other.publisher(other.keys.health("frontend", "b"), blocking=False)
+        wait_until_heard(other, other.keys.health("frontend", "b"))
         for _ in range(5):
             liar.put(b"garbage")
         wait_until(lambda: watch.services().get(("frontend", "a")) == good)
@@ -97,6 +101,7 @@ def test_a_service_that_is_told_to_stop_ends_cleanly_and_soon(
         if role != "router":
             if role == "stubborn":
                 bus.serve(bus.keys.rpc("test", "slow"), lambda *_: time.sleep(20) or b"")  # type: ignore[func-returns-value]
+                wait_until_known(bus)
             process = Process(tmp_path, role, address)
             assert watch.wait_for({role: 1}, 20.0)
         time.sleep(0.2)
@@ -148,7 +153,8 @@ def test_a_service_without_a_router_says_so_in_its_last_line(tmp_path: Path, mon
 def test_a_service_can_be_stopped_while_it_waits_for_a_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TEST_CONNECT_TIMEOUT_S", "60")
     process = Process(tmp_path, "answer", f"tcp/127.0.0.1:{free_port()}")
-    time.sleep(2.0)
+    wait_until(lambda: process.handles(signal.SIGTERM))
+    time.sleep(1.5)  # longer than one attempt to connect
     assert process.terminate() < 2 * EXIT_LIMIT_S
     assert "Traceback" not in process.text()
 
