@@ -208,8 +208,8 @@ def site(folder: Path, *assignments: str, directory: Path | None = None) -> Iter
 
 
 # --- roles -----------------------------------------------------------------------------------------------------------
-def worker(context: ServiceContext, seconds: float) -> None:
-    """Does predict jobs: sleeps with heartbeats, then delivers."""
+def worker(context: ServiceContext, seconds: float, start: Path | None = None) -> None:
+    """Does predict jobs: sleeps with heartbeats, then delivers; the seconds count from when ``start`` exists."""
     while not context.stopping.is_set():
         try:
             lease = context.jobs.claim([JobKind.PREDICT], ["test"], context.worker, 1.0)
@@ -221,8 +221,12 @@ def worker(context: ServiceContext, seconds: float) -> None:
         index = codec.decode(SubmapSpec, lease.job.payload).submap_index
         sys.stdout.write(f"lease {lease.job.job_id} {lease.attempt}\n")
         sys.stdout.flush()
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and not context.stopping.wait(0.1):
+        end: float | None = None
+        while not context.stopping.wait(0.1):
+            if end is None and (start is None or start.exists()):
+                end = time.monotonic() + seconds
+            if end is not None and time.monotonic() >= end:
+                break
             with contextlib.suppress(BusUnavailableError):
                 if not context.jobs.heartbeat(lease.lease_id):
                     break
@@ -271,7 +275,9 @@ def main(arguments: list[str]) -> int:
         case "ledger":
             return service.main(config, directory=Path(rest[0]))
         case "worker":
-            return run_service("inference", config, lambda context: worker(context, float(rest[0])))
+            return run_service(
+                "inference", config, lambda context: worker(context, float(rest[0]), *map(Path, rest[1:]))
+            )
     raise SystemExit(f"unknown role {role}")
 
 
