@@ -11,27 +11,40 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 from vggt_motion.bus import calls, codec, router
 from vggt_motion.bus.keys import last_chunk
 from vggt_motion.bus.service import ServiceContext, run_service
-from vggt_motion.bus.session import Bus, open_bus
+from vggt_motion.bus.serving import Handler
+from vggt_motion.bus.session import Bus, Closable, open_bus
 from vggt_motion.config import BusConfig, Config
 from vggt_motion.errors import BusUnavailableError, DiskFullError, RefusalCode, RequestRefusedError
 from vggt_motion.records import Event, EventKind, LogEntry
 
 _log = logging.getLogger(__name__)
 SESSION = "test"
-READY_S = 20.0
+READY_S = 60.0  # patience only: nothing waits longer than it has to
+EXIT_LIMIT_S = 2.0  # the one limit in time that is part of a contract
 THIS = Path(__file__)
+_kept_ports: deque[socket.socket] = deque(maxlen=64)  # many more than one test asks for
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port that stays the test's own, also while nobody listens on it: before its router starts, and between two.
+
+    The socket remains bound and never listens. A listener that sets SO_REUSEADDR, as Zenoh's and ours do, may join it;
+    but the system gives the port to nobody who asks for any, nor to the near end of a connection, which could otherwise
+    even be made to itself by whoever tries to reach a router that is not there yet.
+    """
+    keeper = socket.socket()
+    keeper.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    keeper.bind(("127.0.0.1", 0))
+    _kept_ports.append(keeper)
+    return int(keeper.getsockname()[1])
 
 
 def bus_config(endpoint: str, **changes: float) -> BusConfig:
@@ -76,6 +89,12 @@ class Process:
     def text(self) -> str:
         return self.log.read_text()
 
+    def handles(self, number: signal.Signals) -> bool:
+        """Whether it has set a handler for a signal: before that, the system ends it."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        caught = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
+        return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
 
 @contextlib.contextmanager
 def running(folder: Path, role: str, endpoint: str, *arguments: str, script: Path = THIS) -> Iterator[Process]:
@@ -99,6 +118,51 @@ def wait_until(condition: object, timeout_s: float = READY_S) -> None:
         time.sleep(0.02)
 
 
+# --- knowing of each other -------------------------------------------------------------------------------------------
+# A declaration takes a moment to travel to the router and on to the others. A request that comes before it finds
+# nobody, and what is published before it is dropped: services repeat and read what they lack, a test has to wait.
+def wait_until_served(asker: Bus, *keys: str) -> None:
+    """Return when requests from a session reach somebody who serves the keys."""
+    for key in keys:
+        querier = asker._session.declare_querier(key)
+        wait_until(lambda querier=querier: querier.matching_status.matching)
+        querier.undeclare()
+
+
+def serve(server: Bus, key: str, handler: Handler, *, asker: Bus, threads: int = 1) -> Closable:
+    """Serve a key, and return when requests of another session are answered."""
+    served = server.serve(key, handler, threads=threads)
+    wait_until_served(asker, key)
+    return served
+
+
+def wait_until_heard(sender: Bus, key: str) -> None:
+    """Return when what a session publishes on a key reaches a subscriber."""
+    _wait_until_subscribed(sender, key, wanted=True)
+
+
+def wait_until_unheard(sender: Bus, key: str) -> None:
+    """Return when a session knows that nobody subscribes to a key any more, so that it can wait for the next one."""
+    _wait_until_subscribed(sender, key, wanted=False)
+
+
+def _wait_until_subscribed(sender: Bus, key: str, *, wanted: bool) -> None:
+    # A publisher beside the test's own: one with a history does not tell, and what a session knows is true for both.
+    probe = sender._session.declare_publisher(key)
+    wait_until(lambda: probe.matching_status.matching is wanted)
+    probe.undeclare()
+
+
+def wait_until_known(bus: Bus) -> None:
+    """Return when the router knows all that a session has declared, and has all that it has published."""
+    # The router takes messages of one link in turn: what came before this request has been dealt with.
+    try:
+        bus.request(bus.keys.rpc("test", "nobody_serves_this"), b"")
+    except BusUnavailableError as error:
+        if "nobody answers" not in str(error):
+            raise
+
+
 # --- roles -----------------------------------------------------------------------------------------------------------
 def answer(context: ServiceContext) -> None:
     """Answers on @rpc/test/*: what the bus promises to carry."""
@@ -119,9 +183,10 @@ def answer(context: ServiceContext) -> None:
                 return b"late"
         raise RequestRefusedError("unknown call", RefusalCode.UNKNOWN)
 
-    for call in ("echo", "conflict", "full", "defect"):
-        context.bus.serve(context.bus.keys.rpc("test", call), handler)
+    # Declarations arrive in order: whoever hears the echo finds the others too.
     context.bus.serve(context.bus.keys.rpc("test", "slow"), handler, threads=2)
+    for call in ("conflict", "full", "defect", "echo"):
+        context.bus.serve(context.bus.keys.rpc("test", call), handler)
     context.set_health("working", "answering", requests=1.0)
     context.stopping.wait()
 
@@ -182,5 +247,13 @@ def main(arguments: list[str]) -> int:
     raise SystemExit(f"unknown role {role}")
 
 
+def leave(code: int) -> NoReturn:
+    """End as the command does: Zenoh's own threads may abort an interpreter that winds down."""
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(main(sys.argv[1:]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import os
 import signal
 import subprocess
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bus_processes import READY_S, SESSION, connect, free_port, wait_until
+from bus_processes import READY_S, SESSION, connect, free_port, leave, wait_until, wait_until_served
 from vggt_motion.bus import codec, router
 from vggt_motion.bus.jobs import JobClient
 from vggt_motion.bus.ledger import LedgerClient
@@ -46,6 +45,27 @@ from vggt_motion.records import (
 )
 
 IMAGE_TYPE = "image/jpeg"
+CALLS = {
+    "ledger": ("append", "read", "status"),
+    "jobs": ("submit", "claim", "heartbeat", "done", "fail", "reports", "cancel"),
+}
+
+
+def wait_until_ledger_is_served(bus: Bus) -> None:
+    """Return when a session reaches every call of a ledger: they are declared one after the other."""
+    client = LedgerClient(bus)
+
+    def is_answered() -> bool:
+        try:
+            client.status()
+        except BusUnavailableError:
+            return False
+        return True
+
+    wait_until(is_answered)
+    wait_until_served(
+        bus, bus.keys.all_blobs(), *(bus.keys.rpc(service, call) for service, calls in CALLS.items() for call in calls)
+    )
 
 
 # --- records ---------------------------------------------------------------------------------------------------------
@@ -163,14 +183,7 @@ class Site:
         return LedgerClient(self.bus).status()
 
     def wait_until_ready(self) -> None:
-        def is_ready() -> bool:
-            try:
-                self.status()
-            except BusUnavailableError:
-                return False
-            return True
-
-        wait_until(is_ready)
+        wait_until_ledger_is_served(self.bus)
 
     def job_state(self, job_id: str) -> str:
         return next(report.state.value for report in self.jobs().reports() if report.job_id == job_id)
@@ -195,8 +208,8 @@ def site(folder: Path, *assignments: str, directory: Path | None = None) -> Iter
 
 
 # --- roles -----------------------------------------------------------------------------------------------------------
-def worker(context: ServiceContext, seconds: float) -> None:
-    """Does predict jobs: sleeps with heartbeats, then delivers."""
+def worker(context: ServiceContext, seconds: float, start: Path | None = None) -> None:
+    """Does predict jobs: sleeps with heartbeats, then delivers; the seconds count from when ``start`` exists."""
     while not context.stopping.is_set():
         try:
             lease = context.jobs.claim([JobKind.PREDICT], ["test"], context.worker, 1.0)
@@ -208,8 +221,12 @@ def worker(context: ServiceContext, seconds: float) -> None:
         index = codec.decode(SubmapSpec, lease.job.payload).submap_index
         sys.stdout.write(f"lease {lease.job.job_id} {lease.attempt}\n")
         sys.stdout.flush()
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and not context.stopping.wait(0.1):
+        end: float | None = None
+        while not context.stopping.wait(0.1):
+            if end is None and (start is None or start.exists()):
+                end = time.monotonic() + seconds
+            if end is not None and time.monotonic() >= end:
+                break
             with contextlib.suppress(BusUnavailableError):
                 if not context.jobs.heartbeat(lease.lease_id):
                     break
@@ -258,13 +275,11 @@ def main(arguments: list[str]) -> int:
         case "ledger":
             return service.main(config, directory=Path(rest[0]))
         case "worker":
-            return run_service("inference", config, lambda context: worker(context, float(rest[0])))
+            return run_service(
+                "inference", config, lambda context: worker(context, float(rest[0]), *map(Path, rest[1:]))
+            )
     raise SystemExit(f"unknown role {role}")
 
 
 if __name__ == "__main__":
-    exit_code = main(sys.argv[1:])
-    logging.shutdown()
-    sys.stdout.flush()
-    # What these tests ask is what a service returns; Zenoh's own threads may abort an interpreter that winds down.
-    os._exit(exit_code)
+    leave(main(sys.argv[1:]))

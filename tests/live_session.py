@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 import subprocess
 import sys
 import time
@@ -13,22 +12,17 @@ from typing import Any
 
 import yaml
 
+from bus_processes import free_port
+from ledger_processes import wait_until_ledger_is_served
 from synthetic_session import Session
 from vggt_motion.bus import codec
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.bus.session import Bus, open_bus
 from vggt_motion.config import Config, load_config
-from vggt_motion.errors import BusUnavailableError
 from vggt_motion.records import HealthReport
 
 PATIENCE_S = 60.0
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_for(condition: Callable[[], Any], what: str = "it", timeout_s: float = PATIENCE_S) -> Any:
@@ -90,14 +84,7 @@ class LiveSession:
         self.watch = ServiceWatch(self.bus)
         self.ledger = LedgerClient(self.bus)
         assert self.watch.wait_for({"ledger": 1}, PATIENCE_S)
-        wait_for(self._is_answered, "the ledger's answer")  # it is alive before it serves
-
-    def _is_answered(self) -> bool:
-        try:
-            self.ledger.status()
-        except BusUnavailableError:
-            return False
-        return True
+        wait_until_ledger_is_served(self.bus)  # it is alive before that
 
     def start(self, name: str, *arguments: str) -> Service:
         log = self.folder / f"{name}.log"

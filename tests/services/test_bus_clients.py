@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from bus_processes import connect, entry, event
+from bus_processes import connect, entry, event, serve
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.jobs import JobClient, many_lines, one_line
 from vggt_motion.bus.ledger import LedgerClient
@@ -47,27 +47,31 @@ LEASE = Lease(JOB, "lease-1", 1, 10.0)
 class FakeLedger:
     """Answers with what a test tells it to, and keeps what it was asked."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, asker: Bus) -> None:
         self._bus = bus
+        self._asker = asker
         self.asked: list[Any] = []
         self.answers: dict[str, Callable[[Any], Any]] = {}
 
     def on(self, service: str, call: str, request: type, answer: Callable[[Any], Any]) -> None:
+        """Answer a call from now on: who asks next is heard."""
+
         def handler(_: str, payload: bytes) -> bytes:
             asked: Any = codec.decode(request, payload)
             self.asked.append(asked)
             return codec.encode(answer(asked))
 
-        self._bus.serve(self._bus.keys.rpc(service, call), handler, threads=4)
+        serve(self._bus, self._bus.keys.rpc(service, call), handler, asker=self._asker, threads=4)
 
     def blobs(self, content: bytes) -> None:
-        self._bus.serve(self._bus.keys.all_blobs(), lambda *_: content)
+        """Answer every request for a blob with this content, from now on."""
+        serve(self._bus, self._bus.keys.all_blobs(), lambda *_: content, asker=self._asker)
 
 
 @pytest.fixture
-def fake(endpoint: str) -> Iterator[FakeLedger]:
+def fake(endpoint: str, bus: Bus) -> Iterator[FakeLedger]:
     with connect(endpoint) as session:
-        yield FakeLedger(session)
+        yield FakeLedger(session, bus)
 
 
 def refusing(error: Exception) -> Callable[[Any], Any]:
@@ -95,12 +99,13 @@ def test_append_waits_for_a_ledger_that_is_not_there_yet(bus: Bus, fake: FakeLed
     )
     timer.start()
     assert LedgerClient(bus).append("event", "event-1", event(1)).was_known
+    timer.join()
     with pytest.raises(BusUnavailableError, match="nobody answers"):
         JobClient(bus).submit([JOB])
 
 
 def test_append_gives_up_when_its_patience_ends_or_when_told_to_stop(bus: Bus) -> None:
-    with pytest.raises(BusUnavailableError):
+    with pytest.raises(BusUnavailableError, match="nobody answers"):
         LedgerClient(bus).append("event", "event-1", event(1), patience_s=0.5)
     threading.Timer(0.5, bus.interrupt).start()
     with pytest.raises(BusUnavailableError, match="stopping"):
@@ -168,7 +173,7 @@ def test_a_claim_whose_answer_was_lost_is_repeated_under_its_name(bus: Bus, fake
 
     fake.on("jobs", "claim", calls.ClaimRequest, answer)
     client = JobClient(bus)
-    with pytest.raises(BusUnavailableError):
+    with pytest.raises(BusUnavailableError, match="restarting"):
         client.claim([JobKind.PREDICT], ["sfm"], "inference/a", 0.1)
     assert client.claim([JobKind.PREDICT], ["sfm"], "inference/a", 0.1) == LEASE
     assert client.claim([JobKind.PREDICT], ["sfm"], "inference/a", 0.1) is None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bus_processes import Process, connect, entry, free_port, running, wait_until
+from bus_processes import Process, connect, entry, free_port, running, serve, wait_until, wait_until_heard
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.follow import Followed, Follower
 from vggt_motion.bus.log import LogFollower
@@ -28,13 +28,13 @@ def take(follower: Follower[Event], count: int, timeout_s: float = 40.0) -> list
     return numbers
 
 
-def serve_log(bus: Bus, entries: list[LogEntry], *, page: int = 7) -> None:
+def serve_log(bus: Bus, entries: list[LogEntry], *, asker: Bus, page: int = 7) -> None:
     def read(_: str, payload: bytes) -> bytes:
         request = codec.decode(calls.ReadRequest, payload)
         answer = entries[request.from_sequence : request.from_sequence + min(page, request.limit)]
         return codec.encode(calls.ReadReply(tuple(answer), len(entries)))
 
-    bus.serve(bus.keys.rpc("ledger", "read"), read)
+    serve(bus, bus.keys.rpc("ledger", "read"), read, asker=asker)
 
 
 def test_live_publications_with_holes_come_out_dense(bus: Bus, endpoint: str, tmp_path: Path) -> None:
@@ -48,7 +48,7 @@ def test_live_publications_with_holes_come_out_dense(bus: Bus, endpoint: str, tm
 
 def test_a_late_follower_reads_from_any_position(endpoint: str, bus: Bus) -> None:
     with connect(endpoint) as ledger:
-        serve_log(ledger, [entry(number) for number in range(700)])
+        serve_log(ledger, [entry(number) for number in range(700)], asker=bus)
         assert take(Follower(bus, "event", Event, from_sequence=0), 700) == list(range(700))
         assert take(Follower(bus, "event", Event, from_sequence=695), 5) == list(range(695, 700))
         at_the_end = Follower(bus, "event", Event, from_sequence=700)
@@ -86,7 +86,7 @@ def test_a_follower_survives_a_ledger_that_comes_back_with_more(bus: Bus, endpoi
 def test_a_lost_last_message_shows_up_all_the_same(endpoint: str, bus: Bus) -> None:
     entries = [entry(0)]
     with connect(endpoint) as ledger:
-        serve_log(ledger, entries)
+        serve_log(ledger, entries, asker=bus)
         follower = Follower(bus, "event", Event)
         assert take(follower, 1) == [0]
         entries.append(entry(1))  # never published
@@ -95,7 +95,7 @@ def test_a_lost_last_message_shows_up_all_the_same(endpoint: str, bus: Bus) -> N
 
 def test_a_follower_that_nobody_takes_from_holds_a_bounded_number(endpoint: str, bus: Bus) -> None:
     with connect(endpoint) as ledger:
-        serve_log(ledger, [entry(number) for number in range(3000)], page=1000)
+        serve_log(ledger, [entry(number) for number in range(3000)], asker=bus, page=1000)
         follower = Follower(bus, "event", Event)
         wait_until(lambda: len(follower._buffer) >= 256)
         time.sleep(0.5)
@@ -106,7 +106,7 @@ def test_a_follower_that_nobody_takes_from_holds_a_bounded_number(endpoint: str,
 def test_a_record_that_cannot_be_decoded_is_passed_over_and_counted(endpoint: str, bus: Bus) -> None:
     bad = LogEntry("event", 1, "event-1", "vggt_motion.v1.Event", b"garbage", 0)
     with connect(endpoint) as ledger:
-        serve_log(ledger, [entry(0), bad, entry(2)])
+        serve_log(ledger, [entry(0), bad, entry(2)], asker=bus)
         follower = Follower(bus, "event", Event)
         assert take(follower, 2) == [0, 2]
         assert follower.skipped_count == 1
@@ -114,7 +114,7 @@ def test_a_record_that_cannot_be_decoded_is_passed_over_and_counted(endpoint: st
 
 def test_another_log_under_the_same_name_is_an_error_not_a_silence(endpoint: str, bus: Bus) -> None:
     with connect(endpoint) as ledger:
-        serve_log(ledger, [entry(number) for number in range(5)])
+        serve_log(ledger, [entry(number) for number in range(5)], asker=bus)
         follower = Follower(bus, "event", Event, from_sequence=9)
 
         def problem() -> bool:
@@ -131,10 +131,11 @@ def test_another_log_under_the_same_name_is_an_error_not_a_silence(endpoint: str
 def test_publications_that_lie_do_not_disturb(endpoint: str, bus: Bus) -> None:
     entries = [entry(number) for number in range(3)]
     with connect(endpoint) as ledger, connect(endpoint) as liar:
-        serve_log(ledger, entries)
+        serve_log(ledger, entries, asker=bus)
         follower = Follower(bus, "event", Event)
         assert take(follower, 3) == [0, 1, 2]
         publisher = liar.publisher(liar.keys.log("event"), blocking=True)
+        wait_until_heard(liar, liar.keys.log("event"))
         for payload in (b"", b"garbage", codec.encode(entry(2**40)), codec.encode(entry(1)), bytes(100_000)):
             publisher.put(payload)
         for number in range(400):
@@ -169,8 +170,8 @@ def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: 
         return codec.encode(calls.ReadReply(tuple(held), len(entries) if request.stream == "event" else 0))
 
     with connect(endpoint) as ledger:
-        ledger.serve(ledger.keys.rpc("ledger", "status"), status)
-        ledger.serve(ledger.keys.rpc("ledger", "read"), read)
+        serve(ledger, ledger.keys.rpc("ledger", "status"), status, asker=bus)
+        serve(ledger, ledger.keys.rpc("ledger", "read"), read, asker=bus)
         log = LogFollower(bus, {Stream.EVENT: 1}, on_status=statuses.append, interval_s=0.1)
         taken: list[str] = []
 
@@ -182,8 +183,10 @@ def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: 
         wait_until(lambda: has(1, 2))
         entries.append(entry(3))  # never published
         wait_until(lambda: has(1, 2, 3))
+        publisher = ledger.publisher(ledger.keys.log("event"), blocking=True)
+        wait_until_heard(ledger, ledger.keys.log("event"))
         entries.append(entry(4))
-        ledger.publisher(ledger.keys.log("event"), blocking=True).put(codec.encode(entries[4]))
+        publisher.put(codec.encode(entries[4]))
         wait_until(lambda: has(1, 2, 3, 4))
         assert log.positions()[Stream.EVENT] == 5
         assert any(answer is not None and answer.position("event") == 4 for answer in statuses)

@@ -11,7 +11,16 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from bus_processes import bus_config, connect, free_port, running, wait_until
+from bus_processes import (
+    bus_config,
+    connect,
+    free_port,
+    running,
+    serve,
+    wait_until,
+    wait_until_heard,
+    wait_until_served,
+)
 from vggt_motion.bus.session import Bus, EndpointTakenError, open_bus, zenoh_config
 from vggt_motion.errors import (
     BusError,
@@ -77,12 +86,18 @@ def test_an_answerer_that_is_killed_ends_the_request(bus: Bus, endpoint: str, tm
 
 def test_waiting_requests_do_not_hold_up_others(endpoint: str) -> None:
     release = threading.Event()
+    begun: list[str] = []
+
+    def wait(key: str, _: bytes) -> bytes:
+        begun.append(key)
+        return b"late" if release.wait(30) else b""
+
     with connect(endpoint) as server, connect(endpoint) as client:
-        server.serve(server.keys.rpc("test", "wait"), lambda *_: b"late" if release.wait(30) else b"", threads=32)
-        server.serve(server.keys.rpc("test", "echo"), lambda _, payload: payload)
+        serve(server, server.keys.rpc("test", "wait"), wait, asker=client, threads=32)
+        serve(server, server.keys.rpc("test", "echo"), lambda _, payload: payload, asker=client)
         with ThreadPoolExecutor(32) as pool:
             waiting = [pool.submit(client.request, client.keys.rpc("test", "wait"), b"") for _ in range(32)]
-            time.sleep(0.3)
+            wait_until(lambda: len(begun) == 32)
             assert client.request(client.keys.rpc("test", "echo"), b"now") == b"now"
             assert not any(future.done() for future in waiting)
             release.set()
@@ -98,7 +113,7 @@ def test_more_requests_than_threads_are_all_answered_each_once(endpoint: str) ->
             seen.append(payload)
             return payload
 
-        server.serve(server.keys.rpc("test", "echo"), handler, threads=3)
+        serve(server, server.keys.rpc("test", "echo"), handler, asker=client, threads=3)
         payloads = [f"{number}".encode() * 1000 for number in range(300)]
         with ThreadPoolExecutor(64) as pool:
             answers = list(pool.map(lambda payload: client.request(client.keys.rpc("test", "echo"), payload), payloads))
@@ -110,18 +125,22 @@ def test_at_most_so_many_handlers_run_at_a_time_and_never_in_zenohs_threads(endp
     names: set[str] = set()
     at_work: list[int] = []
     counts: list[int] = []
+    are_four = threading.Event()
     with connect(endpoint) as server, connect(endpoint) as client:
 
         def handler(_: str, payload: bytes) -> bytes:
             names.add(threading.current_thread().name)
             at_work.append(1)
             counts.append(len(at_work))
-            time.sleep(0.01)
+            if len(at_work) == 4:
+                are_four.set()
+            are_four.wait(30)  # however slowly they come, the first four are there together
+            time.sleep(0.01)  # time for a fifth
             at_work.pop()
             return payload
 
         key = server.keys.rpc("test", "echo")
-        server.serve(key, handler, threads=4)
+        serve(server, key, handler, asker=client, threads=4)
         with ThreadPoolExecutor(16) as pool:
             list(pool.map(lambda _: client.request(key, b""), range(64)))
     assert max(counts) == 4 and names == {f"serve {key}"}
@@ -140,6 +159,7 @@ def test_what_comes_while_others_are_answered_is_answered_together_and_each_for_
     with connect(endpoint) as server, connect(endpoint) as client:
         key = server.keys.rpc("test", "together")
         served = server.serve_together(key, handler, at_a_time=8)
+        wait_until_served(client, key)
         with ThreadPoolExecutor(32) as pool:
             first = pool.submit(client.request, key, b"first")
             wait_until(lambda: bool(batches))
@@ -169,6 +189,7 @@ def test_a_batch_ends_before_it_grows_too_large_and_a_defect_refuses_all_of_it(e
     with connect(endpoint) as server, connect(endpoint) as client:
         key = server.keys.rpc("test", "together")
         served = server.serve_together(key, handler, at_a_time=64)
+        wait_until_served(client, key)
         with ThreadPoolExecutor(8) as pool:
             asked = [pool.submit(client.request, key, bytes(12 * 2**20)) for _ in range(6)]
             wait_until(lambda: len(served._waiting) == 5)  # type: ignore[attr-defined]
@@ -181,20 +202,26 @@ def test_a_batch_ends_before_it_grows_too_large_and_a_defect_refuses_all_of_it(e
 
 def test_a_wildcard_request_is_refused(endpoint: str) -> None:
     with connect(endpoint) as server, connect(endpoint) as client:
-        server.serve(server.keys.all_blobs(), lambda *_: b"content")
+        serve(server, server.keys.all_blobs(), lambda *_: b"content", asker=client)
         assert client.request(client.keys.blob("ab" * 32), b"") == b"content"
         with pytest.raises(RequestRefusedError, match="without wildcards"):
             client.request(client.keys.all_blobs(), b"")
 
 
 def test_closing_a_server_refuses_what_waits_and_frees_the_key(endpoint: str) -> None:
-    release = threading.Event()
+    release, has_begun = threading.Event(), threading.Event()
+
+    def wait(*_: object) -> bytes:
+        has_begun.set()
+        return b"first" if release.wait(30) else b""
+
     with connect(endpoint) as server, connect(endpoint) as client:
         key = server.keys.rpc("test", "wait")
-        served = server.serve(key, lambda *_: b"first" if release.wait(30) else b"")
+        served = serve(server, key, wait, asker=client)
         with ThreadPoolExecutor(2) as pool:
             first, second = (pool.submit(client.request, key, b"") for _ in range(2))
-            time.sleep(0.3)
+            # One is being answered, the other one waits its turn.
+            wait_until(lambda: has_begun.is_set() and len(served._waiting) == 1)  # type: ignore[attr-defined]
             threading.Timer(0.2, release.set).start()
             served.close()
             outcomes = [future.exception(30) or future.result() for future in (first, second)]
@@ -202,7 +229,7 @@ def test_closing_a_server_refuses_what_waits_and_frees_the_key(endpoint: str) ->
         assert any(isinstance(outcome, BusUnavailableError) and "stopping" in str(outcome) for outcome in outcomes)
         with pytest.raises(BusUnavailableError, match="nobody answers"):
             client.request(key, b"")
-        server.serve(key, lambda *_: b"second")
+        serve(server, key, lambda *_: b"second", asker=client)
         assert client.request(key, b"") == b"second"
 
 
@@ -212,15 +239,18 @@ def test_leaving_does_not_wait_for_handlers_that_do_not_end_and_flushes_all_the_
     with connect(endpoint) as client, connect(endpoint) as server, ThreadPoolExecutor(6) as pool:
         client.subscribe(client.keys.all_images(), lambda sample: got.append(sample.payload[:4]))
         keys = [server.keys.rpc("test", f"wait-{number}") for number in range(6)]
+        begun: list[str] = []
+
+        def wait(key: str, _: bytes) -> bytes:
+            begun.append(key)
+            return b"late" if release.wait(60) else b""
+
         for key in keys:
-            server.serve(key, lambda *_: b"late" if release.wait(60) else b"")
+            serve(server, key, wait, asker=client)
         pending = [pool.submit(client.request, key, b"") for key in keys]
         publisher = server.publisher(server.keys.image("front"), blocking=True)
-        for _ in range(100):
-            publisher.put(b"test")
-            if got:
-                break
-            time.sleep(0.05)
+        wait_until_heard(server, server.keys.image("front"))
+        wait_until(lambda: len(begun) == len(keys))
         for number in range(20):
             publisher.put(f"{number:04d}".encode() + bytes(1_000_000))
         server.close()

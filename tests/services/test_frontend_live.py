@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from bus_processes import wait_until
 from live_servers import MjpegServer, RtspServer, numbered_picture, write_transport_stream
 from vggt_motion.config import FrontendConfig
 from vggt_motion.errors import SourceError
@@ -84,7 +85,7 @@ def test_a_reader_that_falls_behind_loses_old_frames_not_new_ones() -> None:
     try:
         stream = source.frames()
         next(stream)
-        time.sleep(1.5)
+        wait_until(lambda: source.dropped_count > 20)
         late = [next(stream) for _ in range(5)]
         now = time.time_ns()
     finally:

@@ -16,9 +16,17 @@ import cv2
 import numpy as np
 import pytest
 
-from bus_processes import SESSION, connect, wait_until
+from bus_processes import (
+    EXIT_LIMIT_S,
+    SESSION,
+    connect,
+    wait_until,
+    wait_until_heard,
+    wait_until_known,
+    wait_until_unheard,
+)
 from vggt_motion.bus import codec
-from vggt_motion.bus.images import ReceivedImage, decode_image, encode_image
+from vggt_motion.bus.images import ImageHeader, ReceivedImage, decode_image, encode_image
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.bus.session import Bus, Sample
@@ -188,7 +196,7 @@ def test_told_to_stop_it_ends_soon_and_leaves_the_stream_open(
     begin = time.monotonic()
     child.terminate()
     assert child.wait(10) == 0
-    assert time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin < EXIT_LIMIT_S
     assert [event.kind for event in services.events()] == [EventKind.SESSION_STARTED]
 
 
@@ -287,15 +295,13 @@ def test_status_while_it_works(services: Services, sequence: Path, tmp_path: Pat
 
 def test_frames_from_the_bus_are_not_published_again(services: Services, sequence: Path, tmp_path: Path) -> None:
     """A replay feeds the frontend over the image key: same records, and each frame is on the key once."""
-    from vggt_motion.bus.images import ImageHeader, encode_image
-
     heard: list[Sample] = []
-    services.bus.subscribe(services.bus.keys.image("front"), heard.append)
     child = services.frontend("zenoh:front")
-    watch = ServiceWatch(services.bus)
-    watch.wait_for({"frontend": 1}, 20)
     with connect(services._endpoint) as camera:
         publisher = camera.publisher(camera.keys.image("front"), blocking=True, history=8)
+        wait_until_heard(camera, camera.keys.image("front"))  # by the frontend: we do not listen yet
+        services.bus.subscribe(services.bus.keys.image("front"), heard.append)
+        wait_until_known(services.bus)
         frames = list(open_source(str(sequence)).frames())
         stop = threading.Event()
         for frame in frames:
@@ -306,11 +312,12 @@ def test_frames_from_the_bus_are_not_published_again(services: Services, sequenc
     keyframes, segments = expected(sequence)
     assert services.keyframes() == keyframes
     assert services.segments() == segments
+    wait_until(lambda: len(heard) >= len(frames))
     assert len(heard) == len(frames)
 
 
-def _is_silent(services: Services) -> bool:
-    report = ServiceWatch(services.bus).wait_for_report("frontend", 5.0)
+def _is_silent(watch: ServiceWatch) -> bool:
+    report = watch.newest_report("frontend")
     return (
         report is not None
         and report.state == "waiting"
@@ -320,24 +327,24 @@ def _is_silent(services: Services) -> bool:
 
 
 def test_a_restarted_live_camera_begins_a_new_epoch(services: Services, sequence: Path) -> None:
-    from vggt_motion.bus.images import ImageHeader, encode_image
-
     frames = list(open_source(str(sequence)).frames())
+    watch = ServiceWatch(services.bus)
     with connect(services._endpoint) as camera:
         for epoch in range(2):
             child = services.frontend("zenoh:front")
-            ServiceWatch(services.bus).wait_for({"frontend": 1}, 20)
             publisher = camera.publisher(camera.keys.image("front"), blocking=True, history=8)
+            wait_until_heard(camera, camera.keys.image("front"))
             for frame in frames[:20]:
                 publisher.put(encode_image(frame, "front"), attachment=ImageHeader(epoch, frame.index).encode())
                 time.sleep(0.02)
             wait_until(lambda wanted=epoch: any(k.epoch == wanted for k in services.keyframes()))
             if epoch == 0:
-                wait_until(lambda: _is_silent(services))  # a camera that has stalled is seen in the status
+                wait_until(lambda: _is_silent(watch))  # a camera that has stalled is seen in the status
             publisher.close()
             child.terminate()
             assert child.wait(10) == 0
-            wait_until(lambda: not ServiceWatch(services.bus).services())
+            wait_until(lambda: watch.missing({"frontend": 1}))
+            wait_until_unheard(camera, camera.keys.image("front"))
     epochs = {keyframe.epoch for keyframe in services.keyframes()}
     assert epochs == {0, 1}
     assert [event.event_id for event in services.events()] == ["session_started", "session_started/1"]
@@ -349,18 +356,22 @@ def test_a_live_camera_loses_no_keyframe_while_the_ledger_is_down(services: Serv
     ledger = services._children[0]
     watch = ServiceWatch(services.bus)
     child = services.frontend("zenoh:front")
-    assert watch.wait_for({"frontend": 1}, 20)
-    spooled = 0.0
+
+    def counter(name: str) -> float:
+        report = watch.newest_report("frontend")
+        return 0.0 if report is None else report.counters.get(name, 0.0)
+
     with connect(services._endpoint) as camera:
         publisher = camera.publisher(camera.keys.image("front"), blocking=False, history=8)
+        wait_until_heard(camera, camera.keys.image("front"))
         for number, frame in enumerate(frames):
             if number == 5:
                 ledger.kill()
                 ledger.wait(10)
+            # Not faster than a busy machine takes them: of more than eight that wait, the frontend drops some.
+            wait_until(lambda wanted=number - 6: counter("frames") >= wanted)
             publisher.put(encode_image(frame, "front"))
-            time.sleep(0.1)
-            report = watch.wait_for_report("frontend", 5.0)
-            spooled = max(spooled, report.counters.get("spooled_records", 0.0) if report is not None else 0.0)
+        wait_until(lambda: counter("spooled_records") > 3)
         services.start("ledger", "--directory", str(services.folder / "ledger"))
         wanted = [keyframe.image for keyframe in expected(sequence)[0]]
 
@@ -374,9 +385,9 @@ def test_a_live_camera_loses_no_keyframe_while_the_ledger_is_down(services: Serv
         wait_until(lambda: len(stored()) >= len(wanted) - 6, 60.0)
         found = stored()  # once: the next look may find one more
         assert found == wanted[: len(found)]
-        report = watch.wait_for_report("frontend", 5.0)
+        report = watch.newest_report("frontend")
     assert report is not None
-    assert spooled > 3 and report.counters["spool_full_waits"] == 0
+    assert report.counters["spool_full_waits"] == 0
     assert not any(count for name, count in report.counters.items() if "dropped" in name)
     child.terminate()
     assert child.wait(10) == 0

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from live_session import LiveSession, Service, free_port, live_session, wait_for
+from live_session import LiveSession, Service, live_session, wait_for
 from synthetic_session import BASE, HEIGHT, WIDTH, Session, world_from_camera
 from vggt_motion.config import Config, GatewayConfig
 from vggt_motion.errors import ConfigurationError
@@ -169,12 +169,12 @@ def test_an_address_of_another_machine_is_refused(host: str) -> None:
 
 @contextlib.contextmanager
 def served(state: GatewayState) -> Iterator[str]:
-    config = GatewayConfig(port=free_port())
+    config = GatewayConfig(port=0)
     listener = bind(config)
     server = HttpServer(create_app(state, config), listener)
     server.start()
     try:
-        yield f"http://127.0.0.1:{config.port}"
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
     finally:
         state.hub.close()
         server.stop()

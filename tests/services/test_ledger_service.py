@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bus_processes import wait_until
+from bus_processes import EXIT_LIMIT_S, READY_S, wait_until
 from ledger_processes import (
+    CALLS,
     Site,
     depth_blob,
     event,
@@ -137,7 +138,7 @@ def test_a_dead_job_is_told_on_the_log_with_the_workers_reason(running: Site) ->
     lease = jobs.claim(PREDICT, [], "inference/a", 0.0)
     assert lease is not None
     assert jobs.fail(lease, "no parallax", "Traceback (most recent call last):\n  ...", is_permanent=True)
-    followed = follower.next(10.0)
+    followed = follower.next(READY_S)
     assert followed is not None and followed.record.kind is EventKind.JOB_DEAD
     assert followed.record.event_id == "job_dead/submap/000000/r1"
     assert followed.record.detail == {
@@ -173,7 +174,7 @@ def test_waiting_claims_hold_up_no_append_and_end_with_the_ledger(running: Site)
     running.jobs().submit([predict(0)])
     wait_until(lambda: len(answers) == 1)
     assert isinstance(answers[0], calls.ClaimReply) and answers[0].lease is not None
-    assert running.ledger.terminate() < 2.0
+    assert running.ledger.terminate() < EXIT_LIMIT_S
     assert running.ledger.process.returncode == 0
     for thread in threads:
         thread.join(10)
@@ -219,8 +220,10 @@ def test_the_late_result_of_a_frozen_worker_is_taken_once(tmp_path: Path) -> Non
 def test_jobs_survive_the_router_and_leases_are_not_lost_with_it(tmp_path: Path) -> None:
     with site(tmp_path) as running:
         running.jobs().submit([predict(number) for number in range(3)])
-        workers = [running.start("worker", "4.0") for _ in range(3)]
+        start = tmp_path / "start"  # none of them is done before the last one has begun
+        workers = [running.start("worker", "4.0", str(start)) for _ in range(3)]
         wait_until(lambda: all(report.state is JobState.LEASED for report in running.jobs().reports()))
+        start.touch()
         running.start_again("router")
         running.wait_until_ready()
         wait_until(lambda: all(report.state is JobState.DONE for report in running.jobs().reports()), 40.0)
@@ -321,11 +324,6 @@ def test_every_job_is_done_once_while_workers_and_ledger_are_killed(tmp_path: Pa
 
 
 # Bad bytes
-
-CALLS = {
-    "ledger": ("append", "read", "status"),
-    "jobs": ("submit", "claim", "heartbeat", "done", "fail", "reports", "cancel"),
-}
 
 
 def hostile_payloads() -> Iterator[tuple[str, str, bytes]]:

@@ -17,6 +17,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from mcap.reader import make_reader
 
+from bus_processes import wait_until_heard
 from live_session import LiveSession, Service, live_session, wait_for
 from synthetic_session import FRAME_INTERVAL_NS, Session, world_from_camera
 from vggt_motion.bus import codec
@@ -49,6 +50,13 @@ def frame(session: Session, index: int) -> Frame:
 def publish(publisher: Publisher, session: Session, indices: range, epoch: int = 0) -> None:
     for index in indices:
         publisher.put(encode_image(frame(session, index), "front"), attachment=ImageHeader(epoch, index).encode())
+
+
+def started_recorder(live: LiveSession, directory: Path) -> Service:
+    """A recorder that hears what is published next."""
+    recorder = live.started("recorder", "--directory", str(directory))
+    wait_until_heard(live.bus, live.bus.keys.image("front"))
+    return recorder
 
 
 def camera(live: LiveSession, history: int = 16) -> Publisher:
@@ -95,7 +103,7 @@ def test_everything_is_recorded_also_what_was_before(tmp_path: Path, session: Se
         publisher = camera(live)
         publish(publisher, session, early)
         live.append(session)
-        recorder = live.started("recorder", "--directory", str(tmp_path))
+        recorder = started_recorder(live, tmp_path)
         publish(publisher, session, range(10, session.frame_count))
         wait_for(lambda: is_caught_up(live, recorder, session.frame_count), "catching up")
         assert recorder.stop() == 0, recorder.text()
@@ -117,7 +125,7 @@ def test_everything_is_recorded_also_what_was_before(tmp_path: Path, session: Se
 def test_a_killed_recorder_goes_on_where_it_was(tmp_path: Path, session: Session) -> None:
     with live_session(tmp_path, recorder={"flush_interval_s": 0.1}) as live:
         publisher = camera(live, history=session.frame_count)
-        recorder = live.started("recorder", "--directory", str(tmp_path))
+        recorder = started_recorder(live, tmp_path)
         half = session.frame_count // 2
         publish(publisher, session, range(half))
         wait_for(lambda: is_caught_up(live, recorder, half), "half of the frames")
@@ -128,13 +136,13 @@ def test_a_killed_recorder_goes_on_where_it_was(tmp_path: Path, session: Session
         scanner.close()
         publish(publisher, session, range(half, session.frame_count))
         live.append(session)
-        again = live.started("recorder", "--directory", str(tmp_path))
+        again = started_recorder(live, tmp_path)
         wait_for(lambda: is_caught_up(live, again, session.frame_count), "catching up")
         assert again.stop() == 0, again.text()
         assert_complete(tmp_path / "run.mcap", live, session)
         # A third one finds nothing to do and adds nothing.
         count = sum(map(len, log_of(tmp_path / "run.mcap").values()))
-        third = live.started("recorder", "--directory", str(tmp_path))
+        third = started_recorder(live, tmp_path)
         wait_for(lambda: is_caught_up(live, third, session.frame_count), "catching up")
         assert third.stop() == 0
         assert sum(map(len, assert_complete(tmp_path / "run.mcap", live, session).values())) == count
@@ -153,13 +161,13 @@ def test_kills_at_any_moment_lose_and_repeat_nothing(tmp_path: Path, session: Se
                 time.sleep(0.05)
 
         feeders = [threading.Thread(target=drive), threading.Thread(target=live.append, args=(session,))]
-        recorder = live.started("recorder", "--directory", str(tmp_path))
+        recorder = started_recorder(live, tmp_path)
         for feeder in feeders:
             feeder.start()
         for moment in moments:
             time.sleep(moment)
             recorder.kill()
-            recorder = live.started("recorder", "--directory", str(tmp_path))
+            recorder = started_recorder(live, tmp_path)
         for feeder in feeders:
             feeder.join()
         wait_for(lambda: is_caught_up(live, recorder, session.frame_count), f"catching up (seed {seed})")
@@ -170,7 +178,7 @@ def test_kills_at_any_moment_lose_and_repeat_nothing(tmp_path: Path, session: Se
 def test_keyframes_that_never_came_are_taken_from_the_ledger(tmp_path: Path, session: Session) -> None:
     with live_session(tmp_path) as live:
         live.append(session)
-        recorder = live.started("recorder", "--directory", str(tmp_path))
+        recorder = started_recorder(live, tmp_path)
         wait_for(lambda: is_caught_up(live, recorder, len(session.keyframes)), "the keyframes")
         report = live.report_of(recorder)
         assert report is not None
@@ -183,7 +191,7 @@ def test_keyframes_that_never_came_are_taken_from_the_ledger(tmp_path: Path, ses
 
 def test_what_is_no_image_is_refused_and_counted(tmp_path: Path, session: Session) -> None:
     with live_session(tmp_path) as live:
-        recorder = live.started("recorder", "--directory", str(tmp_path))
+        recorder = started_recorder(live, tmp_path)
         publisher = camera(live)
         publisher.put(b"\xff\xff\xff")
         publisher.put(encode_image(frame(session, 0), "front"), attachment=b"\xff\xff")

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bus_processes import bus_config, free_port, running
+from bus_processes import bus_config, free_port, running, wait_until_heard
 from vggt_motion.bus.images import encode_image
 from vggt_motion.bus.session import open_bus
 from vggt_motion.config import Config
@@ -157,6 +157,7 @@ def test_frames_of_a_bridge_the_newest_win(config: Config) -> None:
     source.join()
     with open_bus(config.bus) as bus:
         publisher = bus.publisher(bus.keys.image("front"), blocking=True)
+        wait_until_heard(bus, bus.keys.image("front"))
         frames = source.frames()
         publisher.put(encode_image(frame(0), "front"))
         first = next(frames)

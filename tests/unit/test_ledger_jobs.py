@@ -200,10 +200,16 @@ def test_a_claim_waits_no_longer_than_asked(tmp_path: Path) -> None:
 
 def test_a_waiting_claim_gets_a_failed_job_when_its_back_off_is_over(tmp_path: Path) -> None:
     policy = JobPolicy(retry_backoff_s=0.05)
-    ledger = open_ledger(tmp_path / "session", clock=time.monotonic, policy=policy)  # type: ignore[arg-type]
+    start, goes = time.monotonic(), threading.Event()
+    ledger = open_ledger(
+        tmp_path / "session",
+        clock=lambda: time.monotonic() if goes.is_set() else start,  # type: ignore[arg-type]
+        policy=policy,
+    )
     ledger.jobs.submit([predict("a")])
     ledger.jobs.fail("a", claim(ledger).lease_id, "no")
     assert ledger.jobs.claim(PREDICT, (), "inference/a") is None
+    goes.set()  # not before: a busy machine may take longer than the back-off to come here
     lease = ledger.jobs.claim(PREDICT, (), "inference/a", wait_s=30)
     assert lease is not None and lease.attempt == 2
     ledger.close()

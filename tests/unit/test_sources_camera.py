@@ -161,15 +161,22 @@ def test_without_stamps_the_time_of_arrival_counts(stamps: list[float]) -> None:
 
 def test_a_stream_that_breaks_off_is_opened_again_and_times_go_on() -> None:
     opened: list[ScriptedCapture] = []
+    gate = threading.Semaphore(0)
     start = time.time_ns()
 
     def open_capture() -> ScriptedCapture:
-        opened.append(ScriptedCapture([50.0 * k for k in range(1, 4)]))
+        opened.append(ScriptedCapture([50.0 * k for k in range(1, 4)], gate=gate))
         return opened[-1]
 
     source = CameraSource(open_capture, "fake", Selection())
-    frames = list(itertools.islice(source.frames(), 9))
+    stream = source.frames()
+    frames = []
+    for number in range(9):
+        # One read for the frame, and before every fourth frame the one that ends a stream.
+        gate.release(2 if number in (3, 6) else 1)
+        frames.append(next(stream))
     source.close()
+    gate.release()
     assert len(opened) >= 3
     assert source.reconnect_count >= 2
     assert all(capture.is_released for capture in opened[:2])

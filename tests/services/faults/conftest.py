@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fault_run import SMALL_SUBMAPS, FaultRun, Outcome, Snapshot, free_port
+from fault_run import SMALL_SUBMAPS, FaultRun, Outcome, Snapshot
+
+from bus_processes import free_port
 
 SEED_VARIABLE = "VGGT_MOTION_FAULT_SEED"
 _TABLE = pytest.StashKey[dict[str, list[Outcome]]]()

@@ -7,7 +7,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -353,12 +352,6 @@ class Witness:
         self._thread.join(5.0)
         if self._bus is not None:
             self._bus.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def moments(generator: random.Random, count: int, over_s: float) -> list[float]:

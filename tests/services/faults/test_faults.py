@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 from cutting_proxy import CuttingProxy
-from fault_run import FaultRun, Outcome, Snapshot, free_port, moments
+from fault_run import FaultRun, Outcome, Snapshot, moments
 from test_fault_cross_section import SERVICES
 
 import power_loss
+from bus_processes import free_port
 from ledger_helpers import damage_blob
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.jobs import JobClient
