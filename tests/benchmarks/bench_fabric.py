@@ -12,8 +12,8 @@ rounds are repeated, so that a disk that has a bad minute has it for all.
 Then one ``vggt-motion run`` of a source, whose processes are watched. Numerics are the computing children, the pixels
 in the frontend (what the pure pipeline needs for the same frames in this process), the trajectories and maps in the
 recording (what the pure functions need for the same graphs in this process, payloads at hand) and the results that
-``run`` writes after the final graph; everything else after start-up is fabric. Start-up is what a process used before
-the frontend was started, and for the frontend what it used before its first record.
+``run`` writes after the final graph; everything else after start-up is fabric. Start-up ends with the frontend's first
+record: until then the others import, open their files and start their children.
 """
 
 from __future__ import annotations
@@ -399,22 +399,19 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     watched = Watched(psutil.Process(process.pid))
     start_up: dict[str, float] = {}
-    frontend_start_up = run_until_graph = 0.0
+    run_until_graph = 0.0
     is_sending = is_solved = False
     while process.poll() is None:
         watched.look()
         now = watched.by_name()
-        if not start_up and "frontend" in now:
-            start_up = dict(now)
-        if start_up and not is_sending:
+        if not is_sending:
             is_sending = has_record(out / "ledger" / "ledger.db", "event", "session_started")
-            frontend_start_up = now["frontend"]
-        if is_sending and not is_solved:
+            start_up = dict(now)
+        elif not is_solved:
             is_solved = has_record(out / "ledger" / "ledger.db", "graph", "graph/final")
             run_until_graph = now["run"]
         time.sleep(0.1)
     assert process.returncode in (0, 3), f"the run ended with {process.returncode}"
-    start_up["frontend"] = frontend_start_up
     used = {name: seconds - start_up.get(name, 0.0) for name, seconds in watched.by_name().items()}
     numerics = {name: seconds for name, seconds in used.items() if name.endswith(" compute")}
     numerics["frontend"] = min(pixel_seconds(source), used["frontend"])
