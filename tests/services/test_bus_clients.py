@@ -154,6 +154,30 @@ def test_blobs_are_verified(bus: Bus, fake: FakeLedger) -> None:
         LedgerClient(bus).blob(BlobRef(REF.sha256, 3, "image/png"))
 
 
+def test_several_blobs_come_in_order_and_are_asked_for_until_all_are_there(bus: Bus, fake: FakeLedger) -> None:
+    contents = {codec.blob_ref(b"%d" % number, "image/png"): b"%d" % number for number in range(7)}
+    of_hash = {ref.sha256: content for ref, content in contents.items()}
+    fake.on(
+        "ledger",
+        "blobs",
+        calls.BlobsRequest,
+        lambda request: calls.BlobsReply(tuple(of_hash[sha256] for sha256 in request.sha256[:3])),
+    )
+    assert LedgerClient(bus).blobs([]) == []
+    assert fake.asked == []
+    assert LedgerClient(bus).blobs(list(contents)) == list(contents.values())
+    assert [len(request.sha256) for request in fake.asked] == [7, 4, 1]
+
+
+def test_several_blobs_are_verified_each(bus: Bus, fake: FakeLedger) -> None:
+    answers = [(IMAGE, b"other"), (IMAGE, IMAGE, IMAGE)]
+    fake.on("ledger", "blobs", calls.BlobsRequest, lambda _: calls.BlobsReply(answers.pop(0)))
+    with pytest.raises(LedgerError, match="5 bytes came that are not its content"):
+        LedgerClient(bus).blobs([REF, REF])
+    with pytest.raises(CodecError, match="3 blobs came where 2 were asked for"):
+        LedgerClient(bus).blobs([REF, REF])
+
+
 def test_status(bus: Bus, fake: FakeLedger) -> None:
     status = LedgerStatus((StreamPosition("event", 4),), (), 10, 20, True, "", 0, "0a1b")
     fake.on("ledger", "status", calls.StatusRequest, lambda _: status)

@@ -63,6 +63,7 @@ def test_records_and_blobs_come_back_as_they_were_stored(running: Site) -> None:
     frames = [codec.decode(type(frame), entry.payload) for entry in entries]
     assert frames == [keyframe(number, image) for number, image in enumerate(images)]
     assert [client.blob(frame.image) for frame in frames] == images
+    assert client.blobs([frame.image for frame in (*reversed(frames), frames[0])]) == [*reversed(images), images[0]]
     assert client.read("keyframe", 1, limit=1) == entries[1:2]
     assert client.read("segment", 0) == []
     status = client.status()
@@ -86,6 +87,7 @@ def test_what_does_not_exist_is_unknown(running: Site) -> None:
     requests = [
         lambda: client.read("nonsense", 0),
         lambda: client.blob(BlobRef("0" * 64, 1, "image/png")),
+        lambda: client.blobs([BlobRef("0" * 64, 1, "image/png")]),
         lambda: client.append("keyframe", keyframe(0, b"x").keyframe_id, keyframe(0, b"x")),
     ]
     for request in requests:

@@ -259,6 +259,11 @@ STRATEGIES: dict[type, st.SearchStrategy[Any]] = {
     calls.AppendReply: st.builds(calls.AppendReply, indices, st.booleans()),
     calls.ReadRequest: st.builds(calls.ReadRequest, names, indices, counts),
     calls.ReadReply: st.builds(calls.ReadReply, st.lists(log_entries, max_size=3).map(tuple), indices),
+    calls.BlobsRequest: st.builds(
+        calls.BlobsRequest,
+        st.lists(st.binary(min_size=32, max_size=32).map(bytes.hex), min_size=1, max_size=3).map(tuple),
+    ),
+    calls.BlobsReply: st.builds(calls.BlobsReply, st.lists(st.binary(max_size=50), min_size=1, max_size=3).map(tuple)),
     calls.StatusRequest: st.builds(calls.StatusRequest),
     calls.SubmitRequest: st.builds(calls.SubmitRequest, st.lists(jobs, max_size=3).map(tuple)),
     calls.SubmitReply: st.builds(calls.SubmitReply, counts, counts),

@@ -64,6 +64,20 @@ class ReadReply:
 
 
 @dataclass(frozen=True)
+class BlobsRequest:
+    """``@rpc/ledger/blobs``."""
+
+    sha256: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class BlobsReply:
+    """The first of what was asked for, in order; at least one."""
+
+    blobs: tuple[bytes | memoryview, ...]
+
+
+@dataclass(frozen=True)
 class StatusRequest:
     """``@rpc/ledger/status``."""
 

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError, EncodeError, Message
 from vggt_motion.bus.bulk import LIFTED_FROM_BYTES, lift
 from vggt_motion.bus.contract.calls import CALL_PLANS
 from vggt_motion.bus.contract.records import RECORD_PLANS
-from vggt_motion.bus.contract.values import MAX_BLOB_BYTES
+from vggt_motion.bus.contract.values import MAX_BLOB_BYTES, MAX_BLOBS_PER_REQUEST
 from vggt_motion.bus.depth import MEDIA_TYPE as DEPTH_MEDIA_TYPE
 from vggt_motion.bus.depth import decode_depth, encode_depth
 from vggt_motion.bus.scan import check_structure
@@ -25,6 +25,7 @@ from vggt_motion.records import BlobRef, Constraint, Event, GraphUpdate, Keyfram
 
 __all__ = [
     "DEPTH_MEDIA_TYPE",
+    "MAX_BLOBS_PER_REQUEST",
     "MAX_BLOB_BYTES",
     "SCHEMA_VERSION",
     "STREAM_RECORDS",

@@ -43,12 +43,10 @@ class BlobCache:
 
     def fetch(self, refs: Sequence[BlobRef]) -> list[bytes]:
         """The payloads in the order of their references."""
-        current: dict[str, bytes] = {}
-        for ref in refs:
-            if ref.sha256 not in current:
-                known = self._last.get(ref.sha256)
-                current[ref.sha256] = self._ledger.blob(ref) if known is None else known
-        self._last = current
+        missing = {ref.sha256: ref for ref in refs if ref.sha256 not in self._last}
+        fetched = dict(zip(missing, self._ledger.blobs(list(missing.values())), strict=True))
+        known = self._last | fetched
+        current = self._last = {ref.sha256: known[ref.sha256] for ref in refs}
         return [current[ref.sha256] for ref in refs]
 
 

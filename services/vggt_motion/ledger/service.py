@@ -73,6 +73,7 @@ _DONE_THREADS = 8
 _READ_THREADS = 4
 _CLAIM_THREADS = 64
 _FEW_THREADS = 2
+_BLOBS_REPLY_BYTES = 16 * 2**20  # and one blob more
 
 
 def main(config: Config, *, directory: Path) -> int:
@@ -312,6 +313,7 @@ class Desk:
         """Declare every key."""
         handlers: list[tuple[str, int, Callable[[str, bytes], bytes]]] = [
             (bus.keys.rpc("ledger", "read"), _READ_THREADS, lambda _, payload: self.read(payload)),
+            (bus.keys.rpc("ledger", "blobs"), _READ_THREADS, lambda _, payload: self.blobs(payload)),
             (bus.keys.rpc("ledger", "status"), _FEW_THREADS, lambda _, payload: self.answer_status(payload)),
             (bus.keys.all_blobs(), _READ_THREADS, lambda key, _: self.blob(last_chunk(key))),
             (bus.keys.rpc("jobs", "submit"), _FEW_THREADS, lambda _, payload: self.submit(payload)),
@@ -359,6 +361,17 @@ class Desk:
     def blob(self, sha256: str) -> bytes:
         """``@rpc/ledger/blob/{sha256}``."""
         return self._ledger.store.blob(sha256)
+
+    def blobs(self, payload: bytes) -> bytes:
+        """``@rpc/ledger/blobs``."""
+        contents: list[bytes] = []
+        size_bytes = 0
+        for sha256 in codec.decode(calls.BlobsRequest, payload).sha256:
+            contents.append(self._ledger.store.blob(sha256))
+            size_bytes += len(contents[-1])
+            if size_bytes >= _BLOBS_REPLY_BYTES:
+                break
+        return codec.encode(calls.BlobsReply(tuple(contents)))
 
     def answer_status(self, payload: bytes) -> bytes:
         """``@rpc/ledger/status``."""

@@ -12,7 +12,7 @@ import hashlib
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from vggt_motion.backend.state import LogState
@@ -49,6 +49,7 @@ _log = logging.getLogger(__name__)
 RECORDING_FILE = "run.mcap"
 _REPORT_S = 0.5
 _RECORDS_A_TURN = 100
+_BLOBS_A_TURN = 32
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
 _BLOB_PATIENCE_S = 2.0
 _VIEW_REST = 9.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
@@ -188,7 +189,7 @@ class _Recorder:
                 if time.monotonic() - since < _FRAME_PATIENCE_S:
                     continue
                 try:
-                    data = self._fetch(keyframe.image)
+                    data = dict(self._fetched([keyframe.image])).get(keyframe.image)
                 except BusUnavailableError:
                     return
                 if data is not None and self._recording.is_numbered(keyframe.camera):
@@ -232,11 +233,9 @@ class _Recorder:
             for entry in self._context.ledger.read(stream, expected, followed.sequence - expected):
                 self._recording.add_entry(entry)
         if not isinstance(record, Keyframe):
-            for ref in codec.blob_refs(record):
-                if not self._recording.has_blob(ref):
-                    data = self._fetch(ref)
-                    if data is not None:
-                        self._recording.add_blob(ref, data)
+            refs = [ref for ref in codec.blob_refs(record) if not self._recording.has_blob(ref)]
+            for ref, data in self._fetched(refs):
+                self._recording.add_blob(ref, data)
         self._recording.add_entry(followed.entry, self._capture_time_ns(record, followed.entry))
         self._log.apply(record)
         match record:
@@ -247,14 +246,22 @@ class _Recorder:
             case _:
                 pass
 
-    def _fetch(self, ref: BlobRef) -> bytes | None:
-        try:
-            data = self._context.ledger.blob(ref, patience_s=_BLOB_PATIENCE_S)
-            self._payloads.put(ref.sha256, data)
-            return data
-        except (RequestRefusedError, LedgerError) as error:
-            _log.error("payload missing in the recording", extra={"sha256": ref.sha256, "reason": str(error)})
-            return None
+    def _fetched(self, refs: Sequence[BlobRef]) -> Iterator[tuple[BlobRef, bytes]]:
+        """Payloads from the ledger, those that it has."""
+        for first in range(0, len(refs), _BLOBS_A_TURN):
+            some = refs[first : first + _BLOBS_A_TURN]
+            try:
+                found = list(zip(some, self._context.ledger.blobs(some, patience_s=_BLOB_PATIENCE_S), strict=True))
+            except (RequestRefusedError, LedgerError) as error:
+                if len(some) == 1:
+                    _log.error(
+                        "payload missing in the recording", extra={"sha256": some[0].sha256, "reason": str(error)}
+                    )
+                    continue
+                found = [pair for ref in some for pair in self._fetched([ref])]
+            for ref, data in found:
+                self._payloads.put(ref.sha256, data)
+                yield ref, data
 
     def _capture_time_ns(self, record: LogRecord, entry: LogEntry) -> int | None:
         """The moment of the video that a record speaks of: that of its last keyframe."""

@@ -25,15 +25,15 @@ _sym_db = _symbol_database.Default()
 from vggt_motion.v1 import common_pb2 as vggt__motion_dot_v1_dot_common__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bvggt_motion/v1/ledger.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\"]\n\x07Refusal\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12)\n\x04\x63ode\x18\x02 \x01(\x0e\x32\x1b.vggt_motion.v1.RefusalCode\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xc5\x01\n\rAppendRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06stream\x18\x02 \x01(\t\x12\x11\n\trecord_id\x18\x03 \x01(\t\x12\x14\n\x0cpayload_type\x18\x04 \x01(\t\x12\x0f\n\x07payload\x18\x05 \x01(\x0c\x12\x17\n\x0fidentity_sha256\x18\x06 \x01(\x0c\x12\r\n\x05\x62lobs\x18\x07 \x03(\x0c\x12*\n\tblob_refs\x18\x08 \x03(\x0b\x32\x17.vggt_motion.v1.BlobRef\"J\n\x0b\x41ppendReply\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x10\n\x08sequence\x18\x02 \x01(\x04\x12\x11\n\twas_known\x18\x03 \x01(\x08\"\x96\x01\n\x08LogEntry\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06stream\x18\x02 \x01(\t\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12\x11\n\trecord_id\x18\x04 \x01(\t\x12\x14\n\x0cpayload_type\x18\x05 \x01(\t\x12\x0f\n\x07payload\x18\x06 \x01(\x0c\x12\x16\n\x0e\x61ppend_time_ns\x18\x07 \x01(\x03\"[\n\x0bReadRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06stream\x18\x02 \x01(\t\x12\x15\n\rfrom_sequence\x18\x03 \x01(\x04\x12\r\n\x05limit\x18\x04 \x01(\r\"e\n\tReadReply\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12)\n\x07\x65ntries\x18\x02 \x03(\x0b\x32\x18.vggt_motion.v1.LogEntry\x12\x15\n\rnext_sequence\x18\x03 \x01(\x04\"\'\n\rStatusRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\"7\n\x0eStreamPosition\x12\x0e\n\x06stream\x18\x01 \x01(\t\x12\x15\n\rnext_sequence\x18\x02 \x01(\x04\"6\n\x08JobCount\x12\x0c\n\x04kind\x18\x01 \x01(\t\x12\r\n\x05state\x18\x02 \x01(\t\x12\r\n\x05\x63ount\x18\x03 \x01(\x04\"\x89\x02\n\x0cLedgerStatus\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x31\n\tpositions\x18\x02 \x03(\x0b\x32\x1e.vggt_motion.v1.StreamPosition\x12,\n\njob_counts\x18\x03 \x03(\x0b\x32\x18.vggt_motion.v1.JobCount\x12\x14\n\x0cstored_bytes\x18\x04 \x01(\x04\x12\x12\n\nfree_bytes\x18\x05 \x01(\x04\x12\x14\n\x0cis_accepting\x18\x06 \x01(\x08\x12\x0e\n\x06\x64\x65tail\x18\x07 \x01(\t\x12\x1d\n\x15refused_request_count\x18\x08 \x01(\x04\x12\x11\n\tledger_id\x18\t \x01(\t*\xe6\x01\n\x0bRefusalCode\x12\x1c\n\x18REFUSAL_CODE_UNSPECIFIED\x10\x00\x12\x18\n\x14REFUSAL_CODE_INVALID\x10\x01\x12\x19\n\x15REFUSAL_CODE_CONFLICT\x10\x02\x12\x1a\n\x16REFUSAL_CODE_DISK_FULL\x10\x03\x12\x18\n\x14REFUSAL_CODE_UNKNOWN\x10\x04\x12\x15\n\x11REFUSAL_CODE_GONE\x10\x05\x12\x1c\n\x18REFUSAL_CODE_UNAVAILABLE\x10\x06\x12\x19\n\x15REFUSAL_CODE_INTERNAL\x10\x07\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bvggt_motion/v1/ledger.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\"]\n\x07Refusal\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12)\n\x04\x63ode\x18\x02 \x01(\x0e\x32\x1b.vggt_motion.v1.RefusalCode\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xc5\x01\n\rAppendRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06stream\x18\x02 \x01(\t\x12\x11\n\trecord_id\x18\x03 \x01(\t\x12\x14\n\x0cpayload_type\x18\x04 \x01(\t\x12\x0f\n\x07payload\x18\x05 \x01(\x0c\x12\x17\n\x0fidentity_sha256\x18\x06 \x01(\x0c\x12\r\n\x05\x62lobs\x18\x07 \x03(\x0c\x12*\n\tblob_refs\x18\x08 \x03(\x0b\x32\x17.vggt_motion.v1.BlobRef\"J\n\x0b\x41ppendReply\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x10\n\x08sequence\x18\x02 \x01(\x04\x12\x11\n\twas_known\x18\x03 \x01(\x08\"\x96\x01\n\x08LogEntry\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06stream\x18\x02 \x01(\t\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12\x11\n\trecord_id\x18\x04 \x01(\t\x12\x14\n\x0cpayload_type\x18\x05 \x01(\t\x12\x0f\n\x07payload\x18\x06 \x01(\x0c\x12\x16\n\x0e\x61ppend_time_ns\x18\x07 \x01(\x03\"[\n\x0bReadRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06stream\x18\x02 \x01(\t\x12\x15\n\rfrom_sequence\x18\x03 \x01(\x04\x12\r\n\x05limit\x18\x04 \x01(\r\"e\n\tReadReply\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12)\n\x07\x65ntries\x18\x02 \x03(\x0b\x32\x18.vggt_motion.v1.LogEntry\x12\x15\n\rnext_sequence\x18\x03 \x01(\x04\"6\n\x0c\x42lobsRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x0e\n\x06sha256\x18\x02 \x03(\t\"3\n\nBlobsReply\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\r\n\x05\x62lobs\x18\x02 \x03(\x0c\"\'\n\rStatusRequest\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\"7\n\x0eStreamPosition\x12\x0e\n\x06stream\x18\x01 \x01(\t\x12\x15\n\rnext_sequence\x18\x02 \x01(\x04\"6\n\x08JobCount\x12\x0c\n\x04kind\x18\x01 \x01(\t\x12\r\n\x05state\x18\x02 \x01(\t\x12\r\n\x05\x63ount\x18\x03 \x01(\x04\"\x89\x02\n\x0cLedgerStatus\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x31\n\tpositions\x18\x02 \x03(\x0b\x32\x1e.vggt_motion.v1.StreamPosition\x12,\n\njob_counts\x18\x03 \x03(\x0b\x32\x18.vggt_motion.v1.JobCount\x12\x14\n\x0cstored_bytes\x18\x04 \x01(\x04\x12\x12\n\nfree_bytes\x18\x05 \x01(\x04\x12\x14\n\x0cis_accepting\x18\x06 \x01(\x08\x12\x0e\n\x06\x64\x65tail\x18\x07 \x01(\t\x12\x1d\n\x15refused_request_count\x18\x08 \x01(\x04\x12\x11\n\tledger_id\x18\t \x01(\t*\xe6\x01\n\x0bRefusalCode\x12\x1c\n\x18REFUSAL_CODE_UNSPECIFIED\x10\x00\x12\x18\n\x14REFUSAL_CODE_INVALID\x10\x01\x12\x19\n\x15REFUSAL_CODE_CONFLICT\x10\x02\x12\x1a\n\x16REFUSAL_CODE_DISK_FULL\x10\x03\x12\x18\n\x14REFUSAL_CODE_UNKNOWN\x10\x04\x12\x15\n\x11REFUSAL_CODE_GONE\x10\x05\x12\x1c\n\x18REFUSAL_CODE_UNAVAILABLE\x10\x06\x12\x19\n\x15REFUSAL_CODE_INTERNAL\x10\x07\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'vggt_motion.v1.ledger_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_REFUSALCODE']._serialized_start=1219
-  _globals['_REFUSALCODE']._serialized_end=1449
+  _globals['_REFUSALCODE']._serialized_start=1328
+  _globals['_REFUSALCODE']._serialized_end=1558
   _globals['_REFUSAL']._serialized_start=76
   _globals['_REFUSAL']._serialized_end=169
   _globals['_APPENDREQUEST']._serialized_start=172
@@ -46,12 +46,16 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_READREQUEST']._serialized_end=691
   _globals['_READREPLY']._serialized_start=693
   _globals['_READREPLY']._serialized_end=794
-  _globals['_STATUSREQUEST']._serialized_start=796
-  _globals['_STATUSREQUEST']._serialized_end=835
-  _globals['_STREAMPOSITION']._serialized_start=837
-  _globals['_STREAMPOSITION']._serialized_end=892
-  _globals['_JOBCOUNT']._serialized_start=894
-  _globals['_JOBCOUNT']._serialized_end=948
-  _globals['_LEDGERSTATUS']._serialized_start=951
-  _globals['_LEDGERSTATUS']._serialized_end=1216
+  _globals['_BLOBSREQUEST']._serialized_start=796
+  _globals['_BLOBSREQUEST']._serialized_end=850
+  _globals['_BLOBSREPLY']._serialized_start=852
+  _globals['_BLOBSREPLY']._serialized_end=903
+  _globals['_STATUSREQUEST']._serialized_start=905
+  _globals['_STATUSREQUEST']._serialized_end=944
+  _globals['_STREAMPOSITION']._serialized_start=946
+  _globals['_STREAMPOSITION']._serialized_end=1001
+  _globals['_JOBCOUNT']._serialized_start=1003
+  _globals['_JOBCOUNT']._serialized_end=1057
+  _globals['_LEDGERSTATUS']._serialized_start=1060
+  _globals['_LEDGERSTATUS']._serialized_end=1325
 # @@protoc_insertion_point(module_scope)

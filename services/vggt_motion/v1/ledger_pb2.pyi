@@ -106,6 +106,22 @@ class ReadReply(_message.Message):
     next_sequence: int
     def __init__(self, schema_version: _Optional[int] = ..., entries: _Optional[_Iterable[_Union[LogEntry, _Mapping]]] = ..., next_sequence: _Optional[int] = ...) -> None: ...
 
+class BlobsRequest(_message.Message):
+    __slots__ = ("schema_version", "sha256")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    SHA256_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    sha256: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, schema_version: _Optional[int] = ..., sha256: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class BlobsReply(_message.Message):
+    __slots__ = ("schema_version", "blobs")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    BLOBS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    blobs: _containers.RepeatedScalarFieldContainer[bytes]
+    def __init__(self, schema_version: _Optional[int] = ..., blobs: _Optional[_Iterable[bytes]] = ...) -> None: ...
+
 class StatusRequest(_message.Message):
     __slots__ = ("schema_version",)
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
