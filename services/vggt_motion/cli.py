@@ -170,7 +170,7 @@ def serve(
 
 
 def _leave(code: int) -> NoReturn:
-    """End a service's process at once, without the interpreter's teardown.
+    """End a process that has joined the bus at once, without the interpreter's teardown.
 
     All that matters is closed and flushed by then. Foreign threads that are still winding down would make the teardown
     take seconds, or abort it ("exception not rethrown", seen in 2 of 40 ends of the ledger).
@@ -388,7 +388,10 @@ def main() -> None:
         code = error.exit_code
     except BrokenPipeError:
         code = 1  # whoever read our output has gone
-    sys.exit(code if isinstance(code, int) else 0)
+    code = code if isinstance(code, int) else 0
+    if "zenoh" in sys.modules:
+        _leave(code)
+    sys.exit(code)
 
 
 def _complain(message: str) -> None:

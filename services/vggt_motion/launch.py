@@ -106,11 +106,16 @@ def session_identity(request: RunRequest, source: Source) -> SessionIdentity:
     return SessionIdentity(source.description, source.fingerprint, digest)
 
 
-def free_port(host: str = "127.0.0.1") -> int:
-    """A TCP port that nobody listens on at this moment."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
+def keep_port() -> socket.socket:
+    """A socket on a free TCP port of loopback that keeps it for us: bound, and never listening.
+
+    A listener that sets SO_REUSEADDR, as Zenoh's does, may join it; but the system gives the port to nobody else who
+    asks for any, be it another run, or the near end of a connection.
+    """
+    keeper = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    keeper.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    keeper.bind(("127.0.0.1", 0))
+    return keeper
 
 
 def check_port(host: str, port: int) -> None:
@@ -129,11 +134,11 @@ def check_port(host: str, port: int) -> None:
             ) from error
 
 
-def with_free_endpoint(config: Config) -> Config:
-    """The configuration with a router endpoint of its own, unless the user chose one."""
+def with_endpoint(config: Config, kept_port: socket.socket) -> Config:
+    """The configuration with this port for the router, unless the user chose one."""
     if config.bus.endpoint != BusConfig.model_fields["endpoint"].default:
         return config
-    bus = config.bus.model_copy(update={"endpoint": f"tcp/127.0.0.1:{free_port()}"})
+    bus = config.bus.model_copy(update={"endpoint": f"tcp/127.0.0.1:{kept_port.getsockname()[1]}"})
     return config.model_copy(update={"bus": bus})
 
 
@@ -195,7 +200,8 @@ class LocalRun:
         self.identity = session_identity(request, source)
         check_exposure(request.config.gateway)
         check_port(request.config.gateway.host, request.config.gateway.port)
-        config = with_chosen_predictor(with_free_endpoint(request.config))
+        self._kept_port = keep_port()
+        config = with_chosen_predictor(with_endpoint(request.config, self._kept_port))
         if config.spool.directory is None:
             spool = config.spool.model_copy(update={"directory": request.out.absolute() / SPOOL_FOLDER})
             config = config.model_copy(update={"spool": spool})
@@ -251,6 +257,7 @@ class LocalRun:
                     finish(outcome, bus)
             finally:
                 bus.close()
+        self._kept_port.close()
         return outcome
 
     @contextlib.contextmanager

@@ -15,7 +15,7 @@ from vggt_motion.bus.parcels import MIN_PARCEL_BYTES, MemoryParcels, Parcels, op
 from vggt_motion.config import BusConfig
 from vggt_motion.errors import BusUnavailableError
 
-LONG = bytes(range(256)) * 400
+LONG = bytes(range(256)) * 600
 pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="no memory as a file system here")
 
 
@@ -156,7 +156,7 @@ import os, signal, sys
 from pathlib import Path
 from vggt_motion.bus.parcels import MemoryParcels
 side = MemoryParcels(Path({str(folder)!r}))
-assert side.leave(bytes(100_000)) is not None
+assert side.leave(bytes(200_000)) is not None
 os.kill(os.getpid(), signal.SIGKILL)
 """
     alive = MemoryParcels(folder)

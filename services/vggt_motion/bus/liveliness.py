@@ -190,5 +190,9 @@ class ServiceWatch:
                 continue
             if (report.service, report.instance) != name:
                 _log.warning("health under another's name, passed over", extra={"of": who})
-            elif name in self._reports or len(self._reports) < _MAX_SERVICES:
+                continue
+            if len(self._reports) >= _MAX_SERVICES:
+                # Reports that came after the end of their service's token must not keep out those of the living.
+                self._reports = {known: kept for known, kept in self._reports.items() if known in self._alive}
+            if name in self._reports or len(self._reports) < _MAX_SERVICES:
                 self._reports[name] = (report, arrived_at)
