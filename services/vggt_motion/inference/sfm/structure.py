@@ -33,6 +33,10 @@ _GOOD_REPROJECTION_PX = 0.5
 _SAME_COST = 0.02  # relative difference of the costs of starts that ended alike
 _MAX_K1 = 0.6  # beyond it a coefficient describes the scene, not a lens
 _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong distortion is believed
+# Focal length over width and coefficient of many lenses that nobody rectified: where a scene that is grown as if they
+# were rectified ends nowhere near, this does
+_UNRECTIFIED_START = (0.85, -0.36)
+_MAX_REGROWN = 3
 _CAPPED_PX = 1.5  # an observation that misses by more belongs to something else, however far it misses
 _MIN_FRAME_OBSERVATIONS = 15
 # kernel px, gate px, iterations, tolerance
@@ -125,13 +129,11 @@ def solve(
         wide = prior.calibration(width_px, is_unrectified=True)
         distorted = _adjusted(observations, best.registered, positions, width_px, best.scene, wide)
         contradicted = deviations > 2.0
-        if (
-            distorted is not None
-            and abs(distorted.scene.radial_k1) < _MAX_K1
-            and (contradicted or distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost)
-        ):
-            attempts.append(f"with strong distortion: {_outcome(distorted)}")
-            best, calibration = distorted, wide
+        if distorted is not None and (contradicted or distorted.cost < (1.0 - _UNRECTIFIED_GAIN) * best.cost):
+            found, more = _regrown(distorted, observations, positions, prior, wide)
+            attempts.extend(more)
+            if found is not None:
+                best, calibration = found, wide
     polished = _polished(best, observations, [working.grey[p] for p in positions], working.usable, calibration)
     attempts.append(f"measured again: {_outcome(polished)}")
     return _in_unit_steps(polished), attempts
@@ -159,6 +161,48 @@ def solve_from(
         images = [working.grey[p] for p in positions]
         solved = _in_unit_steps(_polished(solved, observations, images, working.usable, calibration))
     return solved, _outcome(solved)
+
+
+def _regrown(
+    distorted: Structure,
+    observations: Observations,
+    positions: Sequence[int],
+    prior: CameraPrior,
+    wide: Calibration,
+) -> tuple[Structure | None, list[str]]:
+    """The scene grown again through the lens that the data shows; None where that is no lens. And what was tried.
+
+    One that was grown as if the images were rectified is bent, most of all in a turn, and keeps its bend in any
+    adjustment: lens and focal length then end where the bend is least, not where they are right.
+    """
+    best, attempts = distorted, [f"with strong distortion: {_outcome(distorted)}"]
+    starts = [(distorted.focal_over_width, distorted.scene.radial_k1)]
+    if distorted.scene.radial_k1 < 0.0:
+        starts.append(_UNRECTIFIED_START)
+    for _ in range(_MAX_REGROWN):
+        ways = parallel.each(
+            lambda start: _from_start(
+                observations,
+                positions,
+                distorted.width_px,
+                replace(prior, radial_k1=float(np.clip(start[1], -_MAX_K1, _MAX_K1))),
+                wide,
+                start[0],
+            ),
+            starts,
+        )
+        attempts.extend(
+            f"grown from focal {focal_start:.2f} widths, distortion {k1_start:+.2f}: {_outcome(way)}"
+            for (focal_start, k1_start), way in zip(starts, ways, strict=True)
+        )
+        better = min((way for way in ways if way is not None), key=_cost_of, default=None)
+        if better is None or better.cost >= best.cost:
+            break
+        is_settled = better.cost > (1.0 - _SAME_COST) * best.cost
+        best, starts = better, [(better.focal_over_width, better.scene.radial_k1)]
+        if is_settled:
+            break
+    return (best if abs(best.scene.radial_k1) < _MAX_K1 else None), attempts
 
 
 def _observations(tracks: Tracks, positions: Sequence[int], working: WorkingImages) -> Observations:
