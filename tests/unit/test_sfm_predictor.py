@@ -147,6 +147,17 @@ def test_a_turn_through_a_lens_that_nobody_rectified(k1: float, k2: float) -> No
     assert found.k2 == pytest.approx(solved.quality.radial_shape * found.k1**2)
 
 
+def test_a_turn_that_came_out_bent_is_not_called_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same scene without the ways that find its lens: the other way, and most observations fit."""
+    monkeypatch.setattr(structure, "_regrown", lambda *_: (None, []))
+    camera = replace(Intrinsics.centred(340.0, 480, 180), k1=-0.35, k2=0.12)
+    poses = sfm_scene.drive(12, 0.8, 60.0)
+    solved = predict(sfm_scene.keyframes(sfm_scene.street(), poses, camera)[0])
+    assert max(rotation_errors_deg(solved, poses)) > 20.0
+    assert solved.verdict is SubmapVerdict.LOW_QUALITY
+    assert "disagree" in solved.reason
+
+
 def test_a_straight_submap_keeps_the_hint_and_does_not_pretend_to_know() -> None:
     poses = sfm_scene.drive(7, 0.8)
     keyframes, _ = sfm_scene.keyframes(sfm_scene.street(), poses, CAMERA)

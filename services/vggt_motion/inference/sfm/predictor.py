@@ -29,6 +29,7 @@ Pair = tuple[int, int]
 
 _MODEL = "sfm"
 _MAX_DISAGREEMENT = 0.03  # of the path, between solutions found in different ways
+_MAX_FOCAL_DEVIATIONS = 3.0  # between such solutions, in standard deviations
 _MIN_MATCHES = 12
 _MATCH_REACH = 4  # keyframes that are matched with each other at most so far apart
 _STILL_PX = 1.0  # matches that a rotation explains this well carry no parallax
@@ -247,9 +248,15 @@ class _Submap:
         if not found:
             return None, ""
         found.sort(key=lambda candidate: verdict.rank(candidate, count), reverse=True)
-        apart = min((verdict.disagreement(other, found[0]) for other in found[1:]), default=0.0)
-        if apart > _MAX_DISAGREEMENT and not verdict.is_convincing(found[0], count):
-            return found[0], f"ways to solve it disagree by {apart:.0%} of the path"
+        if len(found) > 1 and not verdict.is_convincing(found[0], count):
+            others = [(verdict.disagreement(o, found[0]), verdict.focal_deviations(o, found[0]), o) for o in found[1:]]
+            alike = [other for other in others if other[0] <= _MAX_DISAGREEMENT]
+            if not alike:
+                return found[0], f"ways to solve it disagree by {min(apart for apart, _, _ in others):.0%} of the path"
+            # a turn that is bent the other way has nearly the same path, through another lens
+            if min(deviations for _, deviations, _ in alike) > _MAX_FOCAL_DEVIATIONS:
+                focals = f"{found[0].focal_over_width:.2f} and {alike[0][2].focal_over_width:.2f} image widths"
+                return found[0], f"ways to solve it disagree on the focal length, {focals}"
         return found[0], ""
 
     def _solve_in_parts(
