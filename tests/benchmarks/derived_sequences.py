@@ -30,7 +30,7 @@ KITTI_CAMERAS = {  # focal length and principal point of the rectified images, b
     "kitti_06_first51": (707.0912, 601.8873, 183.1104),
 }
 
-_KITTI_LENS = np.array([-0.3728, 0.2037, 0.00222, 0.00138, -0.0722])  # k1, k2, p1, p2, k3 of the raw recordings
+_KITTI_LENS = (-0.3728, 0.2037, 0.00222, 0.00138, -0.0722)  # k1, k2, p1, p2, k3 of the raw recordings
 
 
 def _recorded(data: Path, name: str) -> Frames:
@@ -61,12 +61,16 @@ def _unrectified(data: Path, name: str) -> Frames:
     """Through the lens of KITTI's own camera 0 as it was calibrated, five coefficients, cropped to what is known."""
     focal, cx, cy = KITTI_CAMERAS[name]
     half, half_height = int(0.672 * focal), int(0.245 * focal)
-    lens = np.array([[focal, 0.0, half - 6.0], [0.0, focal, half_height - 8.0], [0.0, 0.0, 1.0]])
     u, v = np.meshgrid(np.arange(2.0 * half), np.arange(2.0 * half_height))
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-8)
-    pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
-    rays = np.asarray(cv2.undistortPointsIter(pixels, lens, _KITTI_LENS, np.eye(3), np.eye(3), criteria))
-    x, y = (rays[:, 0, axis].reshape(u.shape) for axis in (0, 1))
+    seen_x, seen_y = (u - half + 6.0) / focal, (v - half_height + 8.0) / focal
+    k1, k2, p1, p2, k3 = _KITTI_LENS
+    x, y = seen_x, seen_y
+    for _ in range(100):  # a fixed point, as the lens has no inverse in closed form
+        square = x * x + y * y
+        factor = 1.0 + square * (k1 + square * (k2 + square * k3))
+        aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        down = p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        x, y = (seen_x - aside) / factor, (seen_y - down) / factor
     maps = (focal * x + cx).astype(np.float32), (focal * y + cy).astype(np.float32)
     for image, pose in _recorded(data, name):
         yield np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC), dtype=np.uint8), pose

@@ -38,8 +38,8 @@ _UNRECTIFIED_GAIN = 0.05  # relative decrease of the cost for which strong disto
 _UNRECTIFIED_START = (0.85, -0.36)
 _MAX_REGROWN = 3
 # k2 as a multiple of k1 squared. With one coefficient alone a strong lens is not described, and the focal length makes
-# up for it: through KITTI's own unrectified lens turns come out 10 to 15 degrees wrong, with this shape 1. What lenses
-# are found to have: 0.5 to 1.5; 1.8 where the angle from the axis is what the image shows evenly
+# up for it: through the lens of KITTI's raw recordings turns come out 10 to 15 degrees wrong, with this shape 1.
+# Calibrated lenses have 0.5 to 1.5, fisheyes 1.8
 _LENS_SHAPE = 1.0
 _CAPPED_PX = 1.5  # an observation that misses by more belongs to something else, however far it misses
 _MIN_FRAME_OBSERVATIONS = 15
@@ -135,8 +135,10 @@ def solve(
         contradicted = deviations > 2.0
         needed = (1.0 - _UNRECTIFIED_GAIN) * best.cost
         # a turn that was grown without its distortion can end so far off that no lens shows: it then fits badly
-        if distorted is not None and (contradicted or distorted.cost < needed or not _is_convincing(best)):
-            found, more = _regrown(distorted, observations, positions, prior, wide)
+        shows = distorted is not None and (contradicted or distorted.cost < needed)
+        if distorted is not None and (shows or not (prior.is_sure or _is_convincing(best))):
+            likely = [(distorted.focal_over_width, distorted.scene.radial_k1)] if shows else []
+            found, more = _regrown(distorted, [*likely, _UNRECTIFIED_START], observations, positions, prior, wide)
             attempts.extend(more)
             if found is not None and (contradicted or found.cost < needed):
                 best, calibration = found, wide
@@ -172,12 +174,15 @@ def solve_from(
 
 def _regrown(
     distorted: Structure,
+    likely: Sequence[tuple[float, float]],
     observations: Observations,
     positions: Sequence[int],
     prior: CameraPrior,
     wide: Calibration,
 ) -> tuple[Structure | None, list[str]]:
-    """The scene grown again through the lens that the data shows; None where that is no lens. And what was tried.
+    """The scene grown again through likely lenses (focal length over width, k1); None where the best is no lens.
+
+    Also one line for each way that was tried.
 
     One that was grown as if the images were rectified is bent, most of all in a turn, and keeps its bend in any
     adjustment: lens and focal length then end where the bend is least, not where they are right.
@@ -189,7 +194,6 @@ def _regrown(
         return _from_start(observations, positions, distorted.width_px, through, wide, camera.focal_over_width)
 
     attempts = [f"with strong distortion: {_outcome(distorted)}"]
-    likely = [(distorted.focal_over_width, distorted.scene.radial_k1), _UNRECTIFIED_START]
     starts = [_Camera(*camera, shape) for shape in _shapes(prior) for camera in likely]
     best = distorted if distorted.scene.radial_shape in _shapes(prior) else None
     for _ in range(_MAX_REGROWN):
