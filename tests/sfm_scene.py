@@ -150,6 +150,7 @@ def synthetic_problem(
         camera.k1,
         camera.cx - middle[0],
         camera.cy - middle[1],
+        radial_shape=camera.k2 / camera.k1**2 if camera.k2 != 0.0 else 0.0,
     )
     return scene, Observations.build(np.concatenate(point), np.concatenate(frame), np.concatenate(pixel), count)
 

@@ -119,6 +119,7 @@ class FocalHint:
     is_fixed: bool = False  # given by the user: not to be replaced by an estimate
     # Of the images as recorded, where the user gave all of them; refined within the accuracy of a calibration.
     intrinsics: Intrinsics | None = None
+    radial_shape: float = 0.0  # k2 as a multiple of k1 squared
 
 
 class SubmapPart(StrEnum):
@@ -201,6 +202,7 @@ class SubmapQuality:
     focal_relative_sigma: float  # how well this submap alone sees it; inf where it was held
     radial_k1: float = 0.0
     attempts: tuple[str, ...] = ()  # every way that was tried, in order, with its outcome
+    radial_shape: float = 0.0  # k2 as a multiple of k1 squared
 
 
 @dataclass(frozen=True)

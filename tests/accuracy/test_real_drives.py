@@ -60,6 +60,25 @@ def test_a_sequence_is_as_accurate_as_it_was(data_dir: Path, name: str, ate_m: f
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
+    ("name", "ate_m"),
+    [
+        ("kitti_01 unrectified k1=-0.3", 0.20),
+        ("kitti_01 through KITTI's own lens", 0.20),
+        ("kitti_00 through KITTI's own lens", 0.50),
+    ],
+)
+def test_turns_through_a_lens_that_nobody_rectified_are_as_accurate(
+    data_dir: Path, tmp_path: Path, name: str, ate_m: float
+) -> None:
+    folder = derived_sequences.write(name, data_dir, tmp_path)
+    track = track_of(folder.parent, folder.name)
+    poses = read_kitti(folder / "poses.txt").world_from_camera
+    assert len(track) == len(poses)
+    assert metrics.evaluate(PoseTrack(track.times_ns, poses), track).ate_sim3.position_m.rmse < ate_m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
     "name", ["kitti_06 behind a truck", "kitti_06, a truck for a while", "kitti_06 nearing a truck"]
 )
 def test_a_truck_that_fills_half_of_the_view_neither_breaks_nor_bends_the_drive(

@@ -30,6 +30,8 @@ KITTI_CAMERAS = {  # focal length and principal point of the rectified images, b
     "kitti_06_first51": (707.0912, 601.8873, 183.1104),
 }
 
+_KITTI_LENS = (-0.3728, 0.2037, 0.00222, 0.00138, -0.0722)  # k1, k2, p1, p2, k3 of the raw recordings
+
 
 def _recorded(data: Path, name: str) -> Frames:
     rows = np.loadtxt(data / name / "poses.txt").reshape(-1, 3, 4)
@@ -53,6 +55,25 @@ def _distorted(data: Path, name: str, k1: float = -0.3) -> Frames:
             maps = focal * rays[..., 0] + cx, focal * rays[..., 1] + cy
         mapped = cv2.remap(image, maps[0].astype(np.float32), maps[1].astype(np.float32), cv2.INTER_CUBIC)
         yield np.asarray(mapped, dtype=np.uint8), pose
+
+
+def _unrectified(data: Path, name: str) -> Frames:
+    """Through the lens of KITTI's own camera 0 as it was calibrated, five coefficients, cropped to what is known."""
+    focal, cx, cy = KITTI_CAMERAS[name]
+    half, half_height = int(0.672 * focal), int(0.245 * focal)
+    u, v = np.meshgrid(np.arange(2.0 * half), np.arange(2.0 * half_height))
+    seen_x, seen_y = (u - half + 6.0) / focal, (v - half_height + 8.0) / focal
+    k1, k2, p1, p2, k3 = _KITTI_LENS
+    x, y = seen_x, seen_y
+    for _ in range(100):  # a fixed point, as the lens has no inverse in closed form
+        square = x * x + y * y
+        factor = 1.0 + square * (k1 + square * (k2 + square * k3))
+        aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        down = p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        x, y = (seen_x - aside) / factor, (seen_y - down) / factor
+    maps = (focal * x + cx).astype(np.float32), (focal * y + cy).astype(np.float32)
+    for image, pose in _recorded(data, name):
+        yield np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC), dtype=np.uint8), pose
 
 
 def _small(data: Path, name: str) -> Frames:
@@ -161,7 +182,11 @@ def _on_the_spot(radius: float, turn_deg: float, steps: int) -> Frames:
 
 _MAKERS: dict[str, Callable[[Path], Frames]] = {
     "kitti_06 unrectified k1=-0.3": lambda data: _distorted(data, "kitti_06_first51"),
+    "kitti_01 unrectified k1=-0.3": lambda data: _distorted(data, "kitti_01_first51"),
     "kitti_00 unrectified k1=-0.3": lambda data: _distorted(data, "kitti_00_first200"),
+    "kitti_06 through KITTI's own lens": lambda data: _unrectified(data, "kitti_06_first51"),
+    "kitti_01 through KITTI's own lens": lambda data: _unrectified(data, "kitti_01_first51"),
+    "kitti_00 through KITTI's own lens": lambda data: _unrectified(data, "kitti_00_first200"),
     "kitti_00 at 416x128": lambda data: _small(data, "kitti_00_first200"),
     "kitti_06 with a stop": lambda data: _with_stop(data, "kitti_06_first51", 24, 40),
     "kitti_00 with a stop in a turn": lambda data: _with_stop(data, "kitti_00_first200", 106, 40),
@@ -178,7 +203,7 @@ NAMES: Sequence[str] = tuple(_MAKERS)
 
 def write(name: str, data: Path, folder: Path) -> Path:
     """Write one sequence below ``folder`` and return where it is."""
-    location = folder / name.replace(" ", "_").replace(",", "").replace("=", "")
+    location = folder / name.replace(" ", "_").replace(",", "").replace("'", "").replace("=", "")
     if (location / "poses.txt").is_file():
         return location
     (location / "image_0").mkdir(parents=True, exist_ok=True)

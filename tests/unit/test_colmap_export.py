@@ -33,9 +33,9 @@ from vggt_motion.geometry.projection import Intrinsics, project  # noqa: E402
 SCALE = 1.7  # world units per unit of the graph
 
 
-def street_frames(count: int = 6, k1: float = 0.0) -> list[MapFrame]:
+def street_frames(count: int = 6, k1: float = 0.0, k2: float = 0.0) -> list[MapFrame]:
     """Keyframes of a drive along the street, in a submap of odd unit and place; the world is SCALE times the street."""
-    camera = replace(SMALL_CAMERA, k1=k1)
+    camera = replace(SMALL_CAMERA, k1=k1, k2=k2)
     submap_from_world = sim3.exp(np.array([0.1, -0.4, 0.05, 2.0, 1.0, -3.0, 0.3]))
     frames = []
     for n, pose in enumerate(drive(count)):
@@ -50,10 +50,12 @@ def street_frames(count: int = 6, k1: float = 0.0) -> list[MapFrame]:
     return frames
 
 
-def street_model(k1: float = 0.0, max_per_image: int = 100_000, image_k1: float | None = None) -> ColmapModel:
-    frames = street_frames(k1=k1)
+def street_model(
+    k1: float = 0.0, max_per_image: int = 100_000, image_k1: float | None = None, k2: float = 0.0
+) -> ColmapModel:
+    frames = street_frames(k1=k1, k2=k2)
     points = build_map(frames, BackendConfig(), step=8.0, scale=SCALE)
-    file_camera = replace(SMALL_CAMERA, k1=k1 if image_k1 is None else image_k1).resized(1240, 372)
+    file_camera = replace(SMALL_CAMERA, k1=k1 if image_k1 is None else image_k1, k2=k2).resized(1240, 372)
     images = []
     for frame in frames:
         pose = frame.world_from_submap.act_pose(frame.submap_from_camera)
@@ -63,10 +65,12 @@ def street_model(k1: float = 0.0, max_per_image: int = 100_000, image_k1: float 
 
 
 @pytest.mark.parametrize("form", ["text", "binary"])
-@pytest.mark.parametrize("k1", [0.0, -0.1])
-def test_colmap_reads_the_model_with_its_tracks(tmp_path: Path, form: Literal["text", "binary"], k1: float) -> None:
+@pytest.mark.parametrize(("k1", "k2"), [(0.0, 0.0), (-0.1, 0.0), (-0.3, 0.09)])
+def test_colmap_reads_the_model_with_its_tracks(
+    tmp_path: Path, form: Literal["text", "binary"], k1: float, k2: float
+) -> None:
     assert cv2.__version__
-    ours = street_model(k1)
+    ours = street_model(k1, k2=k2)
     assert len(ours.points) > 500
     write_colmap(tmp_path / "sparse" / "0", ours, "binary" if form == "text" else "text")
     write_colmap(tmp_path / "sparse" / "0", ours, form)  # the other form goes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -179,10 +181,14 @@ def test_a_coarse_pass_sums_over_some_blocks_only() -> None:
     np.testing.assert_allclose(kernels.accumulate(*arguments, origin, origin, 1), np.sum(parts, axis=0), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("k1_i", "k1_j"), [(0.0, 0.0), (-0.2, 0.05)])
-def test_unprojection_of_a_pair_against_numpy(k1_i: float, k1_j: float) -> None:
+@pytest.mark.parametrize(
+    ("k_i", "k_j"), [((0.0, 0.0), (0.0, 0.0)), ((-0.2, 0.0), (0.05, 0.0)), ((-0.3, 0.09), (0.0, 0.1))]
+)
+def test_unprojection_of_a_pair_against_numpy(k_i: tuple[float, float], k_j: tuple[float, float]) -> None:
     rng = np.random.default_rng(0)
-    camera_i, camera_j = Intrinsics.centred(60.0, 64, 32, k1_i), Intrinsics.centred(63.0, 64, 32, k1_j)
+    camera_i, camera_j = (
+        replace(Intrinsics.centred(focal, 64, 32), k1=k1, k2=k2) for focal, (k1, k2) in ((60.0, k_i), (63.0, k_j))
+    )
     pose_i, pose_j = se3.exp(rng.normal(0, 1, 6)), se3.exp(rng.normal(0, 1, 6))
     depth_i, depth_j = (rng.uniform(2, 50, (32, 64)).astype(np.float32) for _ in range(2))
     mask = rng.random((32, 64)) < 0.7

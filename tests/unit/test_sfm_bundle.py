@@ -16,6 +16,7 @@ from vggt_motion.inference.sfm.bundle import Calibration, Observations, Scene
 from vggt_motion.inference.sfm.triangulation import triangulate
 
 CAMERA = Intrinsics(400.0, 400.0, 312.0, 96.0, 620, 190, 0.02)
+LENS = replace(CAMERA, k1=-0.35, k2=0.35**2)
 FREE = Calibration((True, True, True, True), (0.0, 0.0, 0.0, 0.0), (math.inf,) * 4)
 HELD = Calibration((False,) * 4, (0.0, 0.0, 0.0, 0.0), (math.inf,) * 4)
 
@@ -35,14 +36,16 @@ def centres(scene: Scene) -> list[np.ndarray]:
     return [-r.T @ t for r, t in zip(scene.rotations, scene.translations, strict=True)]
 
 
-def test_a_disturbed_scene_and_camera_come_back() -> None:
-    truth, observations = sfm_scene.synthetic_problem(sfm_scene.drive(8, 0.9, 50.0), CAMERA)
+@pytest.mark.parametrize("camera", [CAMERA, LENS])
+def test_a_disturbed_scene_and_camera_come_back(camera: Intrinsics) -> None:
+    truth, observations = sfm_scene.synthetic_problem(sfm_scene.drive(8, 0.9, 50.0), camera)
     start = replace(disturbed(truth, 1.0), focal_px=470.0, radial_k1=0.0, principal_u=0.0, principal_v=0.0)
     result = bundle.adjust(start, observations, FREE, 5.0, 1.0, 100, 1e-14)
-    assert result.scene.focal_px == pytest.approx(CAMERA.fx, rel=1e-4)
-    assert result.scene.radial_k1 == pytest.approx(CAMERA.k1, abs=1e-4)
-    assert result.scene.principal_u == pytest.approx(CAMERA.cx - 309.5, abs=0.02)
-    assert result.scene.principal_v == pytest.approx(CAMERA.cy - 94.5, abs=0.02)
+    assert result.scene.focal_px == pytest.approx(camera.fx, rel=1e-4)
+    assert result.scene.radial_k1 == pytest.approx(camera.k1, abs=1e-4)
+    assert result.scene.radial_shape == truth.radial_shape
+    assert result.scene.principal_u == pytest.approx(camera.cx - 309.5, abs=0.02)
+    assert result.scene.principal_v == pytest.approx(camera.cy - 94.5, abs=0.02)
     assert sfm_scene.position_error(centres(result.scene), centres(truth)) < 1e-5
     assert np.abs(bundle.residuals(result.scene, observations)).max() < 1e-2
 
@@ -81,7 +84,8 @@ def dense_normal_equations(
             at = 6 * (k - 1)
             rotations[k] = se3.so3_exp(delta[at : at + 3]) @ rotations[k]
             translations[k] = translations[k] + delta[at + 3 : at + 6]
-        shared = scene.shared + delta[cameras : cameras + 4]
+        shared = scene.shared.copy()
+        shared[:4] += delta[cameras : cameras + 4]
         points = scene.points + delta[cameras + 4 :].reshape(-1, 3)
         return Scene(rotations, translations, points, math.exp(shared[0]), *(float(v) for v in shared[1:]))
 
@@ -97,8 +101,9 @@ def dense_normal_equations(
     return (jacobian * weight[:, None]).T @ jacobian, -(jacobian * weight[:, None]).T @ residual.ravel(), cameras + 4
 
 
-def test_reduced_system_equals_the_schur_complement_of_the_dense_one() -> None:
-    truth, observations = sfm_scene.synthetic_problem(sfm_scene.drive(4, 0.9, 20.0), CAMERA, count=25)
+@pytest.mark.parametrize("camera", [CAMERA, LENS])
+def test_reduced_system_equals_the_schur_complement_of_the_dense_one(camera: Intrinsics) -> None:
+    truth, observations = sfm_scene.synthetic_problem(sfm_scene.drive(4, 0.9, 20.0), camera, count=25)
     seen_often = np.diff(observations.start) >= 2
     observations = observations.subset(seen_often[observations.point])
     kept = np.flatnonzero(np.diff(observations.start))

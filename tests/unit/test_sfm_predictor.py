@@ -16,7 +16,7 @@ import sfm_scene
 from vggt_motion.config import InferenceConfig, IntrinsicsConfig, SfmConfig
 from vggt_motion.errors import MissingDependencyError
 from vggt_motion.geometry import se3
-from vggt_motion.geometry.projection import Intrinsics
+from vggt_motion.geometry.projection import Intrinsics, pixel_rays
 from vggt_motion.inference.predictor import KeyframeImage, Prediction, PredictionHints
 from vggt_motion.inference.registry import create_predictor
 from vggt_motion.inference.sfm import globalmap, images, library, structure, tracks, verdict
@@ -127,6 +127,35 @@ def test_a_fixed_focal_length_is_not_refined(turning: Scenes) -> None:
         assert prediction.quality.focal_over_width == pytest.approx(0.7, rel=1e-9)
         assert prediction.quality.radial_k1 == pytest.approx(0.01, abs=1e-12)
         assert math.isinf(prediction.quality.focal_relative_sigma)
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(-0.35, 0.12), (-0.3, 0.0)])
+def test_a_turn_through_a_lens_that_nobody_rectified(k1: float, k2: float) -> None:
+    camera = replace(Intrinsics.centred(340.0, 480, 180), k1=k1, k2=k2)
+    poses = sfm_scene.drive(12, 0.8, 60.0)
+    keyframes, _ = sfm_scene.keyframes(sfm_scene.street(), poses, camera)
+    solved = predict(keyframes)
+    assert solved.verdict is SubmapVerdict.GOOD
+    assert len(solved.frames) == 12
+    # through no lens at all the turn fits as one the other way, 90 degrees off
+    assert max(rotation_errors_deg(solved, poses)) < 2.0
+    assert sfm_scene.position_error(centres(solved), [pose[:3, 3] for pose in poses]) < 0.004
+    assert solved.quality.focal_over_width == pytest.approx(340.0 / 480, rel=0.04)
+    found = solved.frames[0].intrinsics
+    truth = camera.resized(found.width_px, found.height_px)
+    assert np.abs(pixel_rays(found) - pixel_rays(truth)).max() < 0.08
+    assert found.k2 == pytest.approx(solved.quality.radial_shape * found.k1**2)
+
+
+def test_a_turn_that_came_out_bent_is_not_called_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same scene without the ways that find its lens: the other way, and most observations fit."""
+    monkeypatch.setattr(structure, "_regrown", lambda *_: (None, []))
+    camera = replace(Intrinsics.centred(340.0, 480, 180), k1=-0.35, k2=0.12)
+    poses = sfm_scene.drive(12, 0.8, 60.0)
+    solved = predict(sfm_scene.keyframes(sfm_scene.street(), poses, camera)[0])
+    assert max(rotation_errors_deg(solved, poses)) > 20.0
+    assert solved.verdict is SubmapVerdict.LOW_QUALITY
+    assert "disagree" in solved.reason
 
 
 def test_a_straight_submap_keeps_the_hint_and_does_not_pretend_to_know() -> None:

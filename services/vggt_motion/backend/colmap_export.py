@@ -19,7 +19,7 @@ import numpy.typing as npt
 from vggt_motion.backend.map import MapFrame, PointMap
 from vggt_motion.backend.trajectory import Trajectory, TrajectoryPose
 from vggt_motion.geometry import se3
-from vggt_motion.geometry.projection import Intrinsics, project
+from vggt_motion.geometry.projection import Intrinsics, fold_radius, project
 from vggt_motion.records import Keyframe, SubmapGeometry
 
 _PINHOLE, _SIMPLE_RADIAL, _OPENCV = 1, 2, 4  # COLMAP's model ids
@@ -150,9 +150,9 @@ def _visible(
     inside = _within_field(in_camera, frame.intrinsics)
     candidates = np.flatnonzero(inside)
     on_lattice = project(in_camera[candidates], frame.intrinsics)
-    columns, rows = (np.rint(on_lattice[:, axis]).astype(np.intp) for axis in (0, 1))
-    on_image = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    candidates, columns, rows = candidates[on_image], columns[on_image], rows[on_image]
+    on_image = ((on_lattice >= -0.5) & (on_lattice < np.array([width, height]) - 0.5)).all(axis=1)
+    candidates = candidates[on_image]
+    columns, rows = (np.rint(on_lattice[on_image, axis]).astype(np.intp) for axis in (0, 1))
     depth = frame.depth[rows, columns].astype(np.float64) * frame.world_from_submap.scale * scale
     with np.errstate(divide="ignore", invalid="ignore"):
         on_surface = np.abs(in_camera[candidates, 2] / depth - 1.0) <= _MAX_DEPTH_DIFFERENCE
@@ -166,17 +166,18 @@ def _visible(
 def _within_field(in_camera: npt.NDArray[np.float64], camera: Intrinsics) -> npt.NDArray[np.bool_]:
     """Points (N, 3) before the camera, and within the radius at which a barrel distortion folds back."""
     before = in_camera[:, 2] > 0.0
-    if camera.k1 >= 0.0:
-        return before
+    fold = fold_radius(camera.k1, camera.k2)
     radius = np.hypot(in_camera[:, 0], in_camera[:, 1])
-    return np.asarray(before & (radius * np.sqrt(-3.0 * camera.k1) < in_camera[:, 2]))
+    return np.asarray(before & (radius < fold * np.maximum(in_camera[:, 2], 0.0))) if np.isfinite(fold) else before
 
 
 def without_distortion(image: ColmapImage) -> ColmapImage:
     """The image as :func:`undistort` makes it, a PNG of a pinhole camera: what many splat trainers ask for."""
-    if image.intrinsics.k1 == 0.0:
+    if image.intrinsics.k1 == 0.0 and image.intrinsics.k2 == 0.0:
         return image
-    return replace(image, name=str(Path(image.name).with_suffix(".png")), intrinsics=replace(image.intrinsics, k1=0.0))
+    return replace(
+        image, name=str(Path(image.name).with_suffix(".png")), intrinsics=replace(image.intrinsics, k1=0.0, k2=0.0)
+    )
 
 
 def undistort(pixels: npt.NDArray[np.uint8], camera: Intrinsics) -> npt.NDArray[np.uint8]:
@@ -211,11 +212,11 @@ def write_colmap(directory: Path, model: ColmapModel, form: Literal["text", "bin
 def _parameters(camera: Intrinsics) -> tuple[int, str, list[float]]:
     """Model id, name and parameters."""
     cx, cy = camera.cx + 0.5, camera.cy + 0.5
-    if camera.k1 == 0.0:
+    if camera.k1 == 0.0 and camera.k2 == 0.0:
         return _PINHOLE, "PINHOLE", [camera.fx, camera.fy, cx, cy]
-    if camera.fx == camera.fy:
+    if camera.fx == camera.fy and camera.k2 == 0.0:
         return _SIMPLE_RADIAL, "SIMPLE_RADIAL", [camera.fx, cx, cy, camera.k1]
-    return _OPENCV, "OPENCV", [camera.fx, camera.fy, cx, cy, camera.k1, 0.0, 0.0, 0.0]
+    return _OPENCV, "OPENCV", [camera.fx, camera.fy, cx, cy, camera.k1, camera.k2, 0.0, 0.0]
 
 
 def _pose(image: ColmapImage) -> list[float]:

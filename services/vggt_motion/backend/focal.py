@@ -21,12 +21,13 @@ _MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution to 
 
 
 class FocalEstimate:
-    """Weighted median of the log focal length (in image widths), and of the radial coefficient."""
+    """Weighted median of the log focal length (in image widths), and of the radial coefficient and its shape."""
 
     def __init__(self) -> None:
         """Start without any result."""
         self._log_focals: list[float] = []
         self._k1s: list[float] = []
+        self._shapes: list[float] = []
         self._weights: list[float] = []
 
     def add(self, quality: SubmapQuality | None) -> None:
@@ -37,6 +38,7 @@ class FocalEstimate:
         if math.isfinite(sigma) and math.isfinite(focal) and focal > 0.0:
             self._log_focals.append(math.log(focal))
             self._k1s.append(quality.radial_k1)
+            self._shapes.append(quality.radial_shape)
             self._weights.append(1.0 / (sigma * sigma + _MODEL_SIGMA * _MODEL_SIGMA))
 
     def hint(self) -> FocalHint | None:
@@ -48,6 +50,7 @@ class FocalEstimate:
             focal_over_width=math.exp(log_focal),
             relative_sigma=self._relative_sigma(log_focal),
             radial_k1=_weighted_median(self._k1s, self._weights),
+            radial_shape=_weighted_median(self._shapes, self._weights),
         )
 
     def _relative_sigma(self, log_focal: float) -> float:

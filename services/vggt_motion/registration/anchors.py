@@ -16,7 +16,7 @@ import numpy.typing as npt
 from vggt_motion.config import RegistrationConfig
 from vggt_motion.errors import RegistrationError
 from vggt_motion.geometry import se3
-from vggt_motion.geometry.projection import Intrinsics
+from vggt_motion.geometry.projection import Intrinsics, fold_radius
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.records import Constraint, ConstraintKind, RegistrationAttempt, RegistrationSpec
 from vggt_motion.registration.cameras import align as align_cameras
@@ -334,9 +334,10 @@ def _point_pairs(frames: Sequence[SharedFrame], masks: Sequence[npt.NDArray[np.b
 
 
 def _camera(intrinsics: Intrinsics) -> Array:
-    """Focal lengths, principal point, k1, and the radius at which a barrel distortion folds back."""
-    fold = 1.0 / np.sqrt(-3.0 * intrinsics.k1) if intrinsics.k1 < 0.0 else np.inf
-    return np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1, fold])
+    """Focal lengths, principal point, k1, k2, and the radius at which a barrel distortion folds back."""
+    known = intrinsics
+    fold = fold_radius(known.k1, known.k2)
+    return np.array([known.fx, known.fy, known.cx, known.cy, known.k1, known.k2, fold])
 
 
 def _start(frames: Sequence[SharedFrame], rotation: Array, scale: float) -> Sim3:

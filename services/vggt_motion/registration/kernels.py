@@ -36,7 +36,7 @@ def unproject_pair(
         depth_i: (H, W) along the optical axis, submap i.
         depth_j: (H, W), submap j.
         mask: (H, W) pixels to use; both depths are positive and finite there.
-        camera_i: fx, fy, cx, cy, k1 and the radius at which the distortion folds (inf for none), as submap i has them.
+        camera_i: fx, fy, cx, cy, k1, k2 and the radius at which the distortion folds (inf for none), in submap i.
         camera_j: the same of submap j.
         i_from_camera: (4, 4).
         j_from_camera: (4, 4).
@@ -80,17 +80,18 @@ def unproject_pair(
 def _ray(u: int, v: int, camera: Array) -> tuple[float, float]:
     """Normalised coordinates without distortion of a pixel, as ``geometry.projection.undistort_rays`` finds them."""
     x, y = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1]
-    k1 = camera[4]
-    if k1 == 0.0:
+    k1, k2 = camera[4], camera[5]
+    if k1 == 0.0 and k2 == 0.0:
         return x, y
     distorted = np.sqrt(x * x + y * y)
     if distorted <= 1e-12:
         return x, y
     radius = distorted
     for _ in range(_UNDISTORT_ITERATIONS):
-        slope = max(1.0 + 3.0 * k1 * radius * radius, 0.1)
-        radius -= (radius * (1.0 + k1 * radius * radius) - distorted) / slope
-        radius = min(max(radius, 0.0), camera[5])
+        square, fourth = k1 * radius * radius, k2 * radius * radius * radius * radius
+        slope = max(1.0 + 3.0 * square + 5.0 * fourth, 0.1)
+        radius -= (radius * (1.0 + square + fourth) - distorted) / slope
+        radius = min(max(radius, 0.0), camera[6])
     return x * radius / distorted, y * radius / distorted
 
 

@@ -26,7 +26,7 @@ class Sim3(_message.Message):
     def __init__(self, rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ..., scale: _Optional[float] = ...) -> None: ...
 
 class Intrinsics(_message.Message):
-    __slots__ = ("fx", "fy", "cx", "cy", "width_px", "height_px", "k1")
+    __slots__ = ("fx", "fy", "cx", "cy", "width_px", "height_px", "k1", "k2")
     FX_FIELD_NUMBER: _ClassVar[int]
     FY_FIELD_NUMBER: _ClassVar[int]
     CX_FIELD_NUMBER: _ClassVar[int]
@@ -34,6 +34,7 @@ class Intrinsics(_message.Message):
     WIDTH_PX_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_PX_FIELD_NUMBER: _ClassVar[int]
     K1_FIELD_NUMBER: _ClassVar[int]
+    K2_FIELD_NUMBER: _ClassVar[int]
     fx: float
     fy: float
     cx: float
@@ -41,4 +42,5 @@ class Intrinsics(_message.Message):
     width_px: int
     height_px: int
     k1: float
-    def __init__(self, fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., width_px: _Optional[int] = ..., height_px: _Optional[int] = ..., k1: _Optional[float] = ...) -> None: ...
+    k2: float
+    def __init__(self, fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., width_px: _Optional[int] = ..., height_px: _Optional[int] = ..., k1: _Optional[float] = ..., k2: _Optional[float] = ...) -> None: ...

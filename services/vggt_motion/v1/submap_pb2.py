@@ -26,7 +26,7 @@ from vggt_motion.v1 import common_pb2 as vggt__motion_dot_v1_dot_common__pb2
 from vggt_motion.v1 import keyframe_pb2 as vggt__motion_dot_v1_dot_keyframe__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bvggt_motion/v1/submap.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\x1a\x1dvggt_motion/v1/keyframe.proto\"\x92\x01\n\tFocalHint\x12\x18\n\x10\x66ocal_over_width\x18\x01 \x01(\x01\x12\x16\n\x0erelative_sigma\x18\x02 \x01(\x01\x12\x11\n\tradial_k1\x18\x03 \x01(\x01\x12\x10\n\x08is_fixed\x18\x04 \x01(\x08\x12.\n\nintrinsics\x18\x05 \x01(\x0b\x32\x1a.vggt_motion.v1.Intrinsics\"H\n\x0eZeroMotionCopy\x12\x18\n\x10\x63opy_keyframe_id\x18\x01 \x01(\t\x12\x1c\n\x14original_keyframe_id\x18\x02 \x01(\t\"\xe0\x02\n\nSubmapSpec\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x14\n\x0csubmap_index\x18\x02 \x01(\x04\x12\x10\n\x08revision\x18\x03 \x01(\r\x12\x1c\n\x14overlap_keyframe_ids\x18\x04 \x03(\t\x12\x19\n\x11\x62\x61se_keyframe_ids\x18\x05 \x03(\t\x12\x19\n\x11loop_keyframe_ids\x18\x06 \x03(\t\x12:\n\x12zero_motion_copies\x18\x07 \x03(\x0b\x32\x1e.vggt_motion.v1.ZeroMotionCopy\x12-\n\nfocal_hint\x18\x08 \x01(\x0b\x32\x19.vggt_motion.v1.FocalHint\x12)\n\x08\x65go_mask\x18\t \x01(\x0b\x32\x17.vggt_motion.v1.BlobRef\x12(\n\x04part\x18\n \x01(\x0e\x32\x1a.vggt_motion.v1.SubmapPart\"\xc3\x01\n\rFrameGeometry\x12\x13\n\x0bkeyframe_id\x18\x01 \x01(\t\x12.\n\nintrinsics\x18\x02 \x01(\x0b\x32\x1a.vggt_motion.v1.Intrinsics\x12\x1a\n\x12submap_from_camera\x18\x03 \x03(\x01\x12&\n\x05\x64\x65pth\x18\x04 \x01(\x0b\x32\x17.vggt_motion.v1.BlobRef\x12)\n\x05\x63odec\x18\x05 \x01(\x0e\x32\x1a.vggt_motion.v1.DepthCodec\"\xe9\x01\n\rSubmapQuality\x12\x1e\n\x16registered_frame_count\x18\x01 \x01(\r\x12\"\n\x1amean_reprojection_error_px\x18\x02 \x01(\x01\x12\x1a\n\x12track_inlier_ratio\x18\x03 \x01(\x01\x12\x1b\n\x13median_parallax_deg\x18\x04 \x01(\x01\x12\x18\n\x10\x66ocal_over_width\x18\x05 \x01(\x01\x12\x1c\n\x14\x66ocal_relative_sigma\x18\x06 \x01(\x01\x12\x11\n\tradial_k1\x18\x07 \x01(\x01\x12\x10\n\x08\x61ttempts\x18\x08 \x03(\t\"\xad\x03\n\x0eSubmapGeometry\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12(\n\x04spec\x18\x02 \x01(\x0b\x32\x1a.vggt_motion.v1.SubmapSpec\x12.\n\x07verdict\x18\x03 \x01(\x0e\x32\x1d.vggt_motion.v1.SubmapVerdict\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12-\n\nscale_kind\x18\x05 \x01(\x0e\x32\x19.vggt_motion.v1.ScaleKind\x12\r\n\x05model\x18\x06 \x01(\t\x12-\n\x06\x66rames\x18\x07 \x03(\x0b\x32\x1d.vggt_motion.v1.FrameGeometry\x12.\n\x07quality\x18\x08 \x01(\x0b\x32\x1d.vggt_motion.v1.SubmapQuality\x12G\n\rstage_seconds\x18\t \x03(\x0b\x32\x30.vggt_motion.v1.SubmapGeometry.StageSecondsEntry\x1a\x33\n\x11StageSecondsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"|\n\x0bPredictTask\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12(\n\x04spec\x18\x02 \x01(\x0b\x32\x1a.vggt_motion.v1.SubmapSpec\x12+\n\tkeyframes\x18\x03 \x03(\x0b\x32\x18.vggt_motion.v1.Keyframe*W\n\tScaleKind\x12\x1a\n\x16SCALE_KIND_UNSPECIFIED\x10\x00\x12\x17\n\x13SCALE_KIND_RELATIVE\x10\x01\x12\x15\n\x11SCALE_KIND_METRIC\x10\x02*\xa5\x01\n\rSubmapVerdict\x12\x1e\n\x1aSUBMAP_VERDICT_UNSPECIFIED\x10\x00\x12\x17\n\x13SUBMAP_VERDICT_GOOD\x10\x01\x12\x1e\n\x1aSUBMAP_VERDICT_LOW_QUALITY\x10\x02\x12 \n\x1cSUBMAP_VERDICT_ROTATION_ONLY\x10\x03\x12\x19\n\x15SUBMAP_VERDICT_FAILED\x10\x04*K\n\nDepthCodec\x12\x1b\n\x17\x44\x45PTH_CODEC_UNSPECIFIED\x10\x00\x12 \n\x1c\x44\x45PTH_CODEC_F16_SHUFFLE_ZSTD\x10\x01*b\n\nSubmapPart\x12\x1b\n\x17SUBMAP_PART_UNSPECIFIED\x10\x00\x12\x1a\n\x16SUBMAP_PART_FIRST_HALF\x10\x01\x12\x1b\n\x17SUBMAP_PART_SECOND_HALF\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bvggt_motion/v1/submap.proto\x12\x0evggt_motion.v1\x1a\x1bvggt_motion/v1/common.proto\x1a\x1dvggt_motion/v1/keyframe.proto\"\xa8\x01\n\tFocalHint\x12\x18\n\x10\x66ocal_over_width\x18\x01 \x01(\x01\x12\x16\n\x0erelative_sigma\x18\x02 \x01(\x01\x12\x11\n\tradial_k1\x18\x03 \x01(\x01\x12\x10\n\x08is_fixed\x18\x04 \x01(\x08\x12.\n\nintrinsics\x18\x05 \x01(\x0b\x32\x1a.vggt_motion.v1.Intrinsics\x12\x14\n\x0cradial_shape\x18\x06 \x01(\x01\"H\n\x0eZeroMotionCopy\x12\x18\n\x10\x63opy_keyframe_id\x18\x01 \x01(\t\x12\x1c\n\x14original_keyframe_id\x18\x02 \x01(\t\"\xe0\x02\n\nSubmapSpec\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12\x14\n\x0csubmap_index\x18\x02 \x01(\x04\x12\x10\n\x08revision\x18\x03 \x01(\r\x12\x1c\n\x14overlap_keyframe_ids\x18\x04 \x03(\t\x12\x19\n\x11\x62\x61se_keyframe_ids\x18\x05 \x03(\t\x12\x19\n\x11loop_keyframe_ids\x18\x06 \x03(\t\x12:\n\x12zero_motion_copies\x18\x07 \x03(\x0b\x32\x1e.vggt_motion.v1.ZeroMotionCopy\x12-\n\nfocal_hint\x18\x08 \x01(\x0b\x32\x19.vggt_motion.v1.FocalHint\x12)\n\x08\x65go_mask\x18\t \x01(\x0b\x32\x17.vggt_motion.v1.BlobRef\x12(\n\x04part\x18\n \x01(\x0e\x32\x1a.vggt_motion.v1.SubmapPart\"\xc3\x01\n\rFrameGeometry\x12\x13\n\x0bkeyframe_id\x18\x01 \x01(\t\x12.\n\nintrinsics\x18\x02 \x01(\x0b\x32\x1a.vggt_motion.v1.Intrinsics\x12\x1a\n\x12submap_from_camera\x18\x03 \x03(\x01\x12&\n\x05\x64\x65pth\x18\x04 \x01(\x0b\x32\x17.vggt_motion.v1.BlobRef\x12)\n\x05\x63odec\x18\x05 \x01(\x0e\x32\x1a.vggt_motion.v1.DepthCodec\"\xff\x01\n\rSubmapQuality\x12\x1e\n\x16registered_frame_count\x18\x01 \x01(\r\x12\"\n\x1amean_reprojection_error_px\x18\x02 \x01(\x01\x12\x1a\n\x12track_inlier_ratio\x18\x03 \x01(\x01\x12\x1b\n\x13median_parallax_deg\x18\x04 \x01(\x01\x12\x18\n\x10\x66ocal_over_width\x18\x05 \x01(\x01\x12\x1c\n\x14\x66ocal_relative_sigma\x18\x06 \x01(\x01\x12\x11\n\tradial_k1\x18\x07 \x01(\x01\x12\x10\n\x08\x61ttempts\x18\x08 \x03(\t\x12\x14\n\x0cradial_shape\x18\t \x01(\x01\"\xad\x03\n\x0eSubmapGeometry\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12(\n\x04spec\x18\x02 \x01(\x0b\x32\x1a.vggt_motion.v1.SubmapSpec\x12.\n\x07verdict\x18\x03 \x01(\x0e\x32\x1d.vggt_motion.v1.SubmapVerdict\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12-\n\nscale_kind\x18\x05 \x01(\x0e\x32\x19.vggt_motion.v1.ScaleKind\x12\r\n\x05model\x18\x06 \x01(\t\x12-\n\x06\x66rames\x18\x07 \x03(\x0b\x32\x1d.vggt_motion.v1.FrameGeometry\x12.\n\x07quality\x18\x08 \x01(\x0b\x32\x1d.vggt_motion.v1.SubmapQuality\x12G\n\rstage_seconds\x18\t \x03(\x0b\x32\x30.vggt_motion.v1.SubmapGeometry.StageSecondsEntry\x1a\x33\n\x11StageSecondsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"|\n\x0bPredictTask\x12\x16\n\x0eschema_version\x18\x01 \x01(\r\x12(\n\x04spec\x18\x02 \x01(\x0b\x32\x1a.vggt_motion.v1.SubmapSpec\x12+\n\tkeyframes\x18\x03 \x03(\x0b\x32\x18.vggt_motion.v1.Keyframe*W\n\tScaleKind\x12\x1a\n\x16SCALE_KIND_UNSPECIFIED\x10\x00\x12\x17\n\x13SCALE_KIND_RELATIVE\x10\x01\x12\x15\n\x11SCALE_KIND_METRIC\x10\x02*\xa5\x01\n\rSubmapVerdict\x12\x1e\n\x1aSUBMAP_VERDICT_UNSPECIFIED\x10\x00\x12\x17\n\x13SUBMAP_VERDICT_GOOD\x10\x01\x12\x1e\n\x1aSUBMAP_VERDICT_LOW_QUALITY\x10\x02\x12 \n\x1cSUBMAP_VERDICT_ROTATION_ONLY\x10\x03\x12\x19\n\x15SUBMAP_VERDICT_FAILED\x10\x04*K\n\nDepthCodec\x12\x1b\n\x17\x44\x45PTH_CODEC_UNSPECIFIED\x10\x00\x12 \n\x1c\x44\x45PTH_CODEC_F16_SHUFFLE_ZSTD\x10\x01*b\n\nSubmapPart\x12\x1b\n\x17SUBMAP_PART_UNSPECIFIED\x10\x00\x12\x1a\n\x16SUBMAP_PART_FIRST_HALF\x10\x01\x12\x1b\n\x17SUBMAP_PART_SECOND_HALF\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -35,28 +35,28 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_SUBMAPGEOMETRY_STAGESECONDSENTRY']._loaded_options = None
   _globals['_SUBMAPGEOMETRY_STAGESECONDSENTRY']._serialized_options = b'8\001'
-  _globals['_SCALEKIND']._serialized_start=1677
-  _globals['_SCALEKIND']._serialized_end=1764
-  _globals['_SUBMAPVERDICT']._serialized_start=1767
-  _globals['_SUBMAPVERDICT']._serialized_end=1932
-  _globals['_DEPTHCODEC']._serialized_start=1934
-  _globals['_DEPTHCODEC']._serialized_end=2009
-  _globals['_SUBMAPPART']._serialized_start=2011
-  _globals['_SUBMAPPART']._serialized_end=2109
+  _globals['_SCALEKIND']._serialized_start=1721
+  _globals['_SCALEKIND']._serialized_end=1808
+  _globals['_SUBMAPVERDICT']._serialized_start=1811
+  _globals['_SUBMAPVERDICT']._serialized_end=1976
+  _globals['_DEPTHCODEC']._serialized_start=1978
+  _globals['_DEPTHCODEC']._serialized_end=2053
+  _globals['_SUBMAPPART']._serialized_start=2055
+  _globals['_SUBMAPPART']._serialized_end=2153
   _globals['_FOCALHINT']._serialized_start=108
-  _globals['_FOCALHINT']._serialized_end=254
-  _globals['_ZEROMOTIONCOPY']._serialized_start=256
-  _globals['_ZEROMOTIONCOPY']._serialized_end=328
-  _globals['_SUBMAPSPEC']._serialized_start=331
-  _globals['_SUBMAPSPEC']._serialized_end=683
-  _globals['_FRAMEGEOMETRY']._serialized_start=686
-  _globals['_FRAMEGEOMETRY']._serialized_end=881
-  _globals['_SUBMAPQUALITY']._serialized_start=884
-  _globals['_SUBMAPQUALITY']._serialized_end=1117
-  _globals['_SUBMAPGEOMETRY']._serialized_start=1120
-  _globals['_SUBMAPGEOMETRY']._serialized_end=1549
-  _globals['_SUBMAPGEOMETRY_STAGESECONDSENTRY']._serialized_start=1498
-  _globals['_SUBMAPGEOMETRY_STAGESECONDSENTRY']._serialized_end=1549
-  _globals['_PREDICTTASK']._serialized_start=1551
-  _globals['_PREDICTTASK']._serialized_end=1675
+  _globals['_FOCALHINT']._serialized_end=276
+  _globals['_ZEROMOTIONCOPY']._serialized_start=278
+  _globals['_ZEROMOTIONCOPY']._serialized_end=350
+  _globals['_SUBMAPSPEC']._serialized_start=353
+  _globals['_SUBMAPSPEC']._serialized_end=705
+  _globals['_FRAMEGEOMETRY']._serialized_start=708
+  _globals['_FRAMEGEOMETRY']._serialized_end=903
+  _globals['_SUBMAPQUALITY']._serialized_start=906
+  _globals['_SUBMAPQUALITY']._serialized_end=1161
+  _globals['_SUBMAPGEOMETRY']._serialized_start=1164
+  _globals['_SUBMAPGEOMETRY']._serialized_end=1593
+  _globals['_SUBMAPGEOMETRY_STAGESECONDSENTRY']._serialized_start=1542
+  _globals['_SUBMAPGEOMETRY_STAGESECONDSENTRY']._serialized_end=1593
+  _globals['_PREDICTTASK']._serialized_start=1595
+  _globals['_PREDICTTASK']._serialized_end=1719
 # @@protoc_insertion_point(module_scope)

@@ -47,18 +47,20 @@ SUBMAP_PART_FIRST_HALF: SubmapPart
 SUBMAP_PART_SECOND_HALF: SubmapPart
 
 class FocalHint(_message.Message):
-    __slots__ = ("focal_over_width", "relative_sigma", "radial_k1", "is_fixed", "intrinsics")
+    __slots__ = ("focal_over_width", "relative_sigma", "radial_k1", "is_fixed", "intrinsics", "radial_shape")
     FOCAL_OVER_WIDTH_FIELD_NUMBER: _ClassVar[int]
     RELATIVE_SIGMA_FIELD_NUMBER: _ClassVar[int]
     RADIAL_K1_FIELD_NUMBER: _ClassVar[int]
     IS_FIXED_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    RADIAL_SHAPE_FIELD_NUMBER: _ClassVar[int]
     focal_over_width: float
     relative_sigma: float
     radial_k1: float
     is_fixed: bool
     intrinsics: _common_pb2.Intrinsics
-    def __init__(self, focal_over_width: _Optional[float] = ..., relative_sigma: _Optional[float] = ..., radial_k1: _Optional[float] = ..., is_fixed: bool = ..., intrinsics: _Optional[_Union[_common_pb2.Intrinsics, _Mapping]] = ...) -> None: ...
+    radial_shape: float
+    def __init__(self, focal_over_width: _Optional[float] = ..., relative_sigma: _Optional[float] = ..., radial_k1: _Optional[float] = ..., is_fixed: bool = ..., intrinsics: _Optional[_Union[_common_pb2.Intrinsics, _Mapping]] = ..., radial_shape: _Optional[float] = ...) -> None: ...
 
 class ZeroMotionCopy(_message.Message):
     __slots__ = ("copy_keyframe_id", "original_keyframe_id")
@@ -107,7 +109,7 @@ class FrameGeometry(_message.Message):
     def __init__(self, keyframe_id: _Optional[str] = ..., intrinsics: _Optional[_Union[_common_pb2.Intrinsics, _Mapping]] = ..., submap_from_camera: _Optional[_Iterable[float]] = ..., depth: _Optional[_Union[_common_pb2.BlobRef, _Mapping]] = ..., codec: _Optional[_Union[DepthCodec, str]] = ...) -> None: ...
 
 class SubmapQuality(_message.Message):
-    __slots__ = ("registered_frame_count", "mean_reprojection_error_px", "track_inlier_ratio", "median_parallax_deg", "focal_over_width", "focal_relative_sigma", "radial_k1", "attempts")
+    __slots__ = ("registered_frame_count", "mean_reprojection_error_px", "track_inlier_ratio", "median_parallax_deg", "focal_over_width", "focal_relative_sigma", "radial_k1", "attempts", "radial_shape")
     REGISTERED_FRAME_COUNT_FIELD_NUMBER: _ClassVar[int]
     MEAN_REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
     TRACK_INLIER_RATIO_FIELD_NUMBER: _ClassVar[int]
@@ -116,6 +118,7 @@ class SubmapQuality(_message.Message):
     FOCAL_RELATIVE_SIGMA_FIELD_NUMBER: _ClassVar[int]
     RADIAL_K1_FIELD_NUMBER: _ClassVar[int]
     ATTEMPTS_FIELD_NUMBER: _ClassVar[int]
+    RADIAL_SHAPE_FIELD_NUMBER: _ClassVar[int]
     registered_frame_count: int
     mean_reprojection_error_px: float
     track_inlier_ratio: float
@@ -124,7 +127,8 @@ class SubmapQuality(_message.Message):
     focal_relative_sigma: float
     radial_k1: float
     attempts: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, registered_frame_count: _Optional[int] = ..., mean_reprojection_error_px: _Optional[float] = ..., track_inlier_ratio: _Optional[float] = ..., median_parallax_deg: _Optional[float] = ..., focal_over_width: _Optional[float] = ..., focal_relative_sigma: _Optional[float] = ..., radial_k1: _Optional[float] = ..., attempts: _Optional[_Iterable[str]] = ...) -> None: ...
+    radial_shape: float
+    def __init__(self, registered_frame_count: _Optional[int] = ..., mean_reprojection_error_px: _Optional[float] = ..., track_inlier_ratio: _Optional[float] = ..., median_parallax_deg: _Optional[float] = ..., focal_over_width: _Optional[float] = ..., focal_relative_sigma: _Optional[float] = ..., radial_k1: _Optional[float] = ..., attempts: _Optional[_Iterable[str]] = ..., radial_shape: _Optional[float] = ...) -> None: ...
 
 class SubmapGeometry(_message.Message):
     __slots__ = ("schema_version", "spec", "verdict", "reason", "scale_kind", "model", "frames", "quality", "stage_seconds")

@@ -126,6 +126,7 @@ _INTRINSICS = plan(
         "width_px": SIDE_PX,
         "height_px": SIDE_PX,
         "k1": NUMBER,
+        "k2": NUMBER,
     },
 )
 _OPTIONAL_BLOB = Sub(BLOB_REF, optional=True)
@@ -184,6 +185,7 @@ _FOCAL_HINT = plan(
         "radial_k1": NUMBER,
         "is_fixed": Flag(),
         "intrinsics": Sub(_INTRINSICS, optional=True),
+        "radial_shape": NUMBER,
     },
 )
 SUBMAP_SPEC = plan(
@@ -227,6 +229,7 @@ _SUBMAP_QUALITY = plan(
         "focal_relative_sigma": _CANNOT_TELL,
         "radial_k1": Real(allow_nan=True),
         "attempts": Many(LINE, 256),
+        "radial_shape": Real(allow_nan=True),
     },
 )
 SUBMAP = plan(

@@ -78,7 +78,8 @@ def _place(rotation, translation, shared, x, y, z):  # type: ignore[no-untyped-d
     if pz <= 1e-6:
         return 0.0, 0.0, pz
     a, b = px / pz, py / pz
-    factor = math.exp(shared[0]) * (1.0 + shared[1] * (a * a + b * b))
+    bent = shared[1] * (a * a + b * b)
+    factor = math.exp(shared[0]) * (1.0 + bent + shared[4] * bent * bent)
     return factor * a + shared[2], factor * b + shared[3], pz
 
 

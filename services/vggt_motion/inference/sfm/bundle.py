@@ -37,11 +37,14 @@ class Scene:
     radial_k1: float = 0.0
     principal_u: float = 0.0  # pixels, relative to where the observations have their origin
     principal_v: float = 0.0
+    radial_shape: float = 0.0  # k2 is this times k1 squared: one coefficient, and the way in which lenses bend
 
     @property
     def shared(self) -> Array:
-        """The shared camera as the adjustment sees it: (log focal, k1, principal u, principal v)."""
-        return np.array([math.log(self.focal_px), self.radial_k1, self.principal_u, self.principal_v])
+        """The shared camera as the adjustment sees it: (log focal, k1, principal u and v), and the shape, held."""
+        return np.array(
+            [math.log(self.focal_px), self.radial_k1, self.principal_u, self.principal_v, self.radial_shape]
+        )
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,8 @@ def adjust(
             axis, centre, slot,
         )  # fmt: skip
         moved_rotations, moved_translations = _move_cameras(rotations, translations, step, axis, centre, slot)
-        moved_shared = shared + step[-_SHARED:]
+        moved_shared = shared.copy()
+        moved_shared[:_SHARED] += step[-_SHARED:]
         moved_cost = _cost(
             moved_rotations, moved_translations, moved_points, moved_shared, observations, robust_px, mean, information
         )
@@ -208,10 +212,16 @@ def residuals(scene: Scene, observations: Observations) -> Array:
     z = camera[:, 2]
     safe = np.where(z > _MIN_DEPTH, z, 1.0)
     x, y = camera[:, 0] / safe, camera[:, 1] / safe
-    factor = scene.focal_px * (1.0 + scene.radial_k1 * (x * x + y * y))
+    factor = scene.focal_px * radial_factor(scene, x * x + y * y)
     out = np.stack([x * factor + scene.principal_u, y * factor + scene.principal_v], axis=1) - observations.pixel
     out[z <= _MIN_DEPTH] = 1e3
     return np.asarray(out)
+
+
+def radial_factor(scene: Scene, square: Array) -> Array:
+    """What the lens makes of normalised coordinates whose squared radius is ``square``: they are multiplied by it."""
+    bent = scene.radial_k1 * square
+    return np.asarray(1.0 + bent + scene.radial_shape * bent * bent)
 
 
 def looks_one_way(rotations: Array) -> bool:
@@ -247,12 +257,12 @@ def _cost(
     data = _data_cost(
         rotations, translations, points, shared, observations.start, observations.frame, observations.pixel, robust_px
     )
-    return float(data) + float((information * (shared - mean) ** 2).sum())
+    return float(data) + float((information * (shared[:_SHARED] - mean) ** 2).sum())
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _data_cost(rotations, translations, points, shared, start, frame, pixel, robust_px):  # type: ignore[no-untyped-def]
-    focal, k1 = math.exp(shared[0]), shared[1]
+    focal, k1, shape = math.exp(shared[0]), shared[1], shared[4]
     width = robust_px * robust_px
     behind = width * math.log(1.0 + _BEHIND_PX**2 / width)
     cost = 0.0
@@ -266,7 +276,8 @@ def _data_cost(rotations, translations, points, shared, start, frame, pixel, rob
                 cost += behind
                 continue
             a, b = x / z, y / z
-            factor = focal * (1.0 + k1 * (a * a + b * b))
+            bent = k1 * (a * a + b * b)
+            factor = focal * (1.0 + bent + shape * bent * bent)
             du, dv = factor * a + shared[2] - pixel[o, 0], factor * b + shared[3] - pixel[o, 1]
             cost += width * math.log(1.0 + (du * du + dv * dv) / width)
     return cost
@@ -303,7 +314,7 @@ def _reduce(  # type: ignore[no-untyped-def]
     """
     size = _DIMENSIONS_OF_CAMERA * (slot.max() + 1) + _SHARED
     base = size - _SHARED
-    focal, k1 = math.exp(shared[0]), shared[1]
+    focal, k1, shape = math.exp(shared[0]), shared[1], shared[4]
     width = robust_px * robust_px
     system = np.zeros((size, size))
     right = np.zeros(size)
@@ -343,11 +354,14 @@ def _reduce(  # type: ignore[no-untyped-def]
             inverse_depth = 1.0 / depth
             a, b = (rx + translations[f, 0]) * inverse_depth, (ry + translations[f, 1]) * inverse_depth
             square = a * a + b * b
-            radial = 1.0 + k1 * square
+            bent = k1 * square
+            radial = 1.0 + bent + shape * bent * bent
+            slope = 1.0 + 2.0 * shape * bent  # of the factor by what is bent
+            by_square = 2.0 * focal * k1 * slope
             du, dv = focal * radial * a + shared[2] - pixel[o, 0], focal * radial * b + shared[3] - pixel[o, 1]
             weight = 1.0 / (1.0 + (du * du + dv * dv) / width)
             # derivative of the pixel by the normalised ray, then by the point in the camera
-            aa, ab, bb = focal * (radial + 2 * k1 * a * a), focal * 2 * k1 * a * b, focal * (radial + 2 * k1 * b * b)
+            aa, ab, bb = focal * radial + by_square * a * a, by_square * a * b, focal * radial + by_square * b * b
             a00, a01, a02 = aa * inverse_depth, ab * inverse_depth, -(aa * a + ab * b) * inverse_depth
             a10, a11, a12 = a01, bb * inverse_depth, -(ab * a + bb * b) * inverse_depth
             w00, w01, w02, w10, w11, w12 = (
@@ -396,7 +410,7 @@ def _reduce(  # type: ignore[no-untyped-def]
                 reach = ex * (rx + translations[f, 0]) + ey * (ry + translations[f, 1]) + ez * depth
                 on_shared[0, 0] += reach * (a00 * ex + a01 * ey + a02 * ez)
                 on_shared[0, 1] += reach * (a10 * ex + a11 * ey + a12 * ez)
-                on_shared[1, 0], on_shared[1, 1] = focal * square * a, focal * square * b
+                on_shared[1, 0], on_shared[1, 1] = focal * square * slope * a, focal * square * slope * b
                 on_shared[2, 0], on_shared[3, 1] = 1.0, 1.0
                 for k in range(_SHARED):
                     if not free[k]:

@@ -86,7 +86,9 @@ def dense_depth(
     matched = dict(zip(matchable, parallel.each(match, matchable), strict=True))
     sigma = {position: _relative_sigma(matched[position]) for position in matched}
     rays = pixel_rays(intrinsics)
-    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1])
+    camera = np.array(
+        [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1, intrinsics.k2], dtype=np.float64
+    )
     nothing = np.zeros(usable.shape, dtype=np.float32)
     maps = {}
     for position in positions:
@@ -213,7 +215,8 @@ def agreement(inverse_depth, sigma, other_inverse_depth, other_sigma, other_from
             if pz < 0.05:
                 continue
             a, b = px / pz, py / pz
-            factor = 1.0 + camera[4] * (a * a + b * b)
+            square = a * a + b * b
+            factor = 1.0 + camera[4] * square + camera[5] * square * square
             u = math.floor(camera[0] * a * factor + camera[2] + 0.5)
             v = math.floor(camera[1] * b * factor + camera[3] + 0.5)
             if u < 0 or v < 0 or u >= width or v >= height:

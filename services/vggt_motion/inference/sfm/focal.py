@@ -20,7 +20,7 @@ PIXEL_SIGMA = 1.0
 _TYPICAL_FOCAL_OVER_WIDTH = 0.85
 _TYPICAL_FOCAL_LOG_SIGMA = 0.5
 _PRINCIPAL_SIGMA_OVER_WIDTH = 0.012
-_K1_SIGMA = 0.03  # of images that somebody rectified, or nearly
+K1_SIGMA = 0.03  # of images that somebody rectified, or nearly
 _UNRECTIFIED_K1_SIGMA = 0.3
 # Of what a user gives. Held without any play, KITTI's own calibration costs more than it helps, for the rectified
 # images keep a little distortion: 1.08 m on KITTI 00 instead of 0.21 m.
@@ -42,6 +42,7 @@ class CameraPrior:
     radial_k1: float = 0.0
     is_fixed: bool = False
     principal_over_width: tuple[float, float] | None = None  # from the middle of the image; None = near it
+    radial_shape: float = 0.0  # k2 as a multiple of k1 squared
 
     @property
     def is_sure(self) -> bool:
@@ -78,14 +79,14 @@ class CameraPrior:
         return Calibration(
             free=(not self.is_fixed, not self.is_fixed, True, True),
             mean=(math.log(focal * width_px), self.radial_k1, 0.0, 0.0),
-            sigma=(sigma, _UNRECTIFIED_K1_SIGMA if is_unrectified else _K1_SIGMA, principal, principal),
+            sigma=(sigma, _UNRECTIFIED_K1_SIGMA if is_unrectified else K1_SIGMA, principal, principal),
         )
 
     def _near_calibration(self, width_px: int) -> Calibration:
         """A given calibration, within its accuracy: one coefficient does not describe a lens, nor for ever."""
         assert self.focal_over_width is not None  # it is given together with the principal point
         principal = _GIVEN_PRINCIPAL_SIGMA_OVER_WIDTH * width_px
-        k1_sigma = _GIVEN_K1_SIGMA if self.radial_k1 != 0.0 else _K1_SIGMA
+        k1_sigma = _GIVEN_K1_SIGMA if self.radial_k1 != 0.0 else K1_SIGMA
         return Calibration(
             free=(True, True, True, True),
             mean=(math.log(self.focal_over_width * width_px), self.radial_k1, *self.principal_px(width_px)),

@@ -88,7 +88,7 @@ def rays_of(observations: Observations, camera: Scene) -> Array:
     """Normalised coordinates (O, 2) without distortion of all observations."""
     x = (observations.pixel[:, 0] - camera.principal_u) / camera.focal_px
     y = (observations.pixel[:, 1] - camera.principal_v) / camera.focal_px
-    return np.stack(undistort_rays(x, y, camera.radial_k1), axis=1)
+    return np.stack(undistort_rays(x, y, camera.radial_k1, camera.radial_shape * camera.radial_k1**2), axis=1)
 
 
 def settle(
@@ -313,7 +313,7 @@ def refine_pose(rotation, translation, points, pixels, shared, widths):  # type:
 
     Returns the robust cost at the last width, the rotation (3, 3) and the translation (3,).
     """
-    focal, k1 = np.exp(shared[0]), shared[1]
+    focal, k1, shape = np.exp(shared[0]), shared[1], shared[4]
     r, t = rotation.copy(), translation.copy()
     cost = 0.0
     for iteration in range(len(widths) + 1):
@@ -331,14 +331,15 @@ def refine_pose(rotation, translation, points, pixels, shared, widths):  # type:
                 cost += width * np.log(1.0 + 2500.0 / width)
                 continue
             a, b = (rx + t[0]) / z, (ry + t[1]) / z
-            q = a * a + b * b
-            radial = 1.0 + k1 * q
+            bent = k1 * (a * a + b * b)
+            radial = 1.0 + bent + shape * bent * bent
+            by_square = 2.0 * focal * k1 * (1.0 + 2.0 * shape * bent)
             du = focal * radial * a + shared[2] - pixels[p, 0]
             dv = focal * radial * b + shared[3] - pixels[p, 1]
             e = du * du + dv * dv
             weight = 1.0 / (1.0 + e / width)
             cost += width * np.log(1.0 + e / width)
-            aa, ab, bb = focal * (radial + 2 * k1 * a * a), focal * 2 * k1 * a * b, focal * (radial + 2 * k1 * b * b)
+            aa, ab, bb = focal * radial + by_square * a * a, by_square * a * b, focal * radial + by_square * b * b
             j[0, 3], j[0, 4], j[0, 5] = aa / z, ab / z, -(aa * a + ab * b) / z
             j[1, 3], j[1, 4], j[1, 5] = ab / z, bb / z, -(ab * a + bb * b) / z
             for i in range(2):

@@ -29,6 +29,7 @@ Pair = tuple[int, int]
 
 _MODEL = "sfm"
 _MAX_DISAGREEMENT = 0.03  # of the path, between solutions found in different ways
+_MAX_FOCAL_DEVIATIONS = 3.0  # between such solutions, in standard deviations
 _MIN_MATCHES = 12
 _MATCH_REACH = 4  # keyframes that are matched with each other at most so far apart
 _STILL_PX = 1.0  # matches that a rotation explains this well carry no parallax
@@ -247,9 +248,15 @@ class _Submap:
         if not found:
             return None, ""
         found.sort(key=lambda candidate: verdict.rank(candidate, count), reverse=True)
-        apart = min((verdict.disagreement(other, found[0]) for other in found[1:]), default=0.0)
-        if apart > _MAX_DISAGREEMENT and not verdict.is_convincing(found[0], count):
-            return found[0], f"ways to solve it disagree by {apart:.0%} of the path"
+        if len(found) > 1 and not verdict.is_convincing(found[0], count):
+            others = [(verdict.disagreement(o, found[0]), verdict.focal_deviations(o, found[0]), o) for o in found[1:]]
+            alike = [other for other in others if other[0] <= _MAX_DISAGREEMENT]
+            if not alike:
+                return found[0], f"ways to solve it disagree by {min(apart for apart, _, _ in others):.0%} of the path"
+            # a turn that is bent the other way has nearly the same path, through another lens
+            if min(deviations for _, deviations, _ in alike) > _MAX_FOCAL_DEVIATIONS:
+                focals = f"{found[0].focal_over_width:.2f} and {alike[0][2].focal_over_width:.2f} image widths"
+                return found[0], f"ways to solve it disagree on the focal length, {focals}"
         return found[0], ""
 
     def _solve_in_parts(
@@ -270,7 +277,10 @@ class _Submap:
             return None
         hint = self._hint
         if hint is None or not hint.is_fixed:
-            hint = FocalHint(solved.focal_over_width, _PART_RELATIVE_SIGMA, solved.scene.radial_k1)
+            scene = solved.scene
+            hint = FocalHint(
+                solved.focal_over_width, _PART_RELATIVE_SIGMA, scene.radial_k1, radial_shape=scene.radial_shape
+            )
         placed: dict[int, PredictedFrame] = {}
         qualities = []
         for part in parts:
@@ -313,6 +323,7 @@ class _Submap:
             focal_relative_sigma=math.inf,
             radial_k1=hint.radial_k1,
             attempts=tuple(self._attempts),
+            radial_shape=hint.radial_shape,
         )
         reason = "the camera turned on the spot: the scale after it is carried over, not measured"
         return self._prediction(everywhere, SubmapVerdict.LOW_QUALITY, reason, quality)
@@ -355,7 +366,13 @@ class _Submap:
             return CameraPrior()
         known = hint.intrinsics
         if known is None:
-            return CameraPrior(hint.focal_over_width, hint.relative_sigma, hint.radial_k1, hint.is_fixed)
+            return CameraPrior(
+                hint.focal_over_width,
+                hint.relative_sigma,
+                hint.radial_k1,
+                hint.is_fixed,
+                radial_shape=hint.radial_shape,
+            )
         # the working images have square pixels of the width of the recorded ones
         principal = (
             (known.cx - 0.5 * (known.width_px - 1)) / known.width_px,
@@ -374,7 +391,8 @@ class _Submap:
         assumed = focal_over_width or prior.focal_over_width or _FALLBACK_FOCAL_OVER_WIDTH
         u, v = prior.principal_px(working.width_px)
         middle = Intrinsics.centred(assumed * working.width_px, working.width_px, working.height_px, prior.radial_k1)
-        return replace(middle, cx=middle.cx + u, cy=middle.cy + v)
+        k2 = prior.radial_shape * prior.radial_k1**2
+        return replace(middle, cx=middle.cx + u, cy=middle.cy + v, k2=k2)
 
     def _frames(self, solved: structure.Structure, working: images.WorkingImages) -> tuple[PredictedFrame, ...]:
         width, height = images.fitted_size(working.width_px, working.height_px, self._config.sfm.depth_width_px)
@@ -460,6 +478,7 @@ class _Submap:
             focal_relative_sigma=solved.focal_relative_sigma,
             radial_k1=solved.scene.radial_k1,
             attempts=tuple(self._attempts),
+            radial_shape=solved.scene.radial_shape,
         )
 
     def _rotation_only(self, turned: rotation.RotationFit, working: images.WorkingImages) -> Prediction:
@@ -489,6 +508,7 @@ class _Submap:
             focal_relative_sigma=math.inf,
             radial_k1=intrinsics.k1,
             attempts=tuple(self._attempts),
+            radial_shape=self._prior().radial_shape,
         )
         return self._prediction(tuple(frames), SubmapVerdict.ROTATION_ONLY, _NO_DEPTH, quality)
 
@@ -519,7 +539,7 @@ def _matched(followed: tracks.Tracks, positions: Sequence[int], camera: Intrinsi
 
     def straight(pixel: Array) -> Array:
         x, y = (pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy
-        return camera.fx * np.stack(undistort_rays(x, y, camera.k1), axis=1)
+        return camera.fx * np.stack(undistort_rays(x, y, camera.k1, camera.k2), axis=1)
 
     matched = {}
     for index, a in enumerate(positions):
@@ -546,6 +566,7 @@ def _intrinsics(scene: Scene, working: images.WorkingImages) -> Intrinsics:
         width_px=working.width_px,
         height_px=working.height_px,
         k1=scene.radial_k1,
+        k2=scene.radial_shape * scene.radial_k1**2,
     )
 
 

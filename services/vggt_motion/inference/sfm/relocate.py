@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from vggt_motion.geometry import se3
 from vggt_motion.geometry.projection import Intrinsics, undistort_rays
-from vggt_motion.inference.sfm import features, growth
+from vggt_motion.inference.sfm import bundle, features, growth
 from vggt_motion.inference.sfm.bundle import Scene
 from vggt_motion.inference.sfm.depth import DepthMap
 from vggt_motion.inference.sfm.images import WorkingImages
@@ -100,7 +100,7 @@ def _correspondences(
         row, column = np.clip(row, 0, depth.shape[0] - 1), np.clip(column, 0, depth.shape[1] - 1)
         known = confidence[row, column] > _MIN_CONFIDENCE
         x, y = (at[known, 0] - camera.cx) / camera.fx, (at[known, 1] - camera.cy) / camera.fy
-        x, y = undistort_rays(x, y, camera.k1)
+        x, y = undistort_rays(x, y, camera.k1, camera.k2)
         rays = np.column_stack([x, y, np.ones(len(x))])
         in_camera = rays * depth[row[known], column[known], None].astype(np.float64)
         pixels.append(detected.points[rows[known, 0]].astype(np.float64))
@@ -114,7 +114,8 @@ def _resect(
 ) -> tuple[Array, npt.NDArray[np.bool_]] | None:
     if len(pixels) < _MIN_INLIERS:
         return None
-    x, y = undistort_rays((pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, camera.k1)
+    x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+    x, y = undistort_rays(x, y, camera.k1, camera.k2)
     rays = np.column_stack([x, y])
     cv2.setRNGSeed(0)  # the generator is the library's own and remembers earlier calls
     solved, vector, translation, _ = cv2.solvePnPRansac(
@@ -151,6 +152,6 @@ def _errors(rotation: Array, translation: Array, points: Array, pixels: Array, s
     moved = points @ rotation.T + translation
     z = np.where(moved[:, 2] > 1e-9, moved[:, 2], np.nan)
     x, y = moved[:, 0] / z, moved[:, 1] / z
-    factor = scene.focal_px * (1.0 + scene.radial_k1 * (x * x + y * y))
+    factor = scene.focal_px * bundle.radial_factor(scene, x * x + y * y)
     error = np.hypot(x * factor + scene.principal_u - pixels[:, 0], y * factor + scene.principal_v - pixels[:, 1])
     return np.asarray(np.where(np.isfinite(error), error, np.inf))

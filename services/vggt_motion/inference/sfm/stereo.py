@@ -97,7 +97,8 @@ def match(
 
 
 def _camera(intrinsics: Intrinsics) -> npt.NDArray[np.float32]:
-    return np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.k1], dtype=np.float32)
+    known = intrinsics
+    return np.array([known.fx, known.fy, known.cx, known.cy, known.k1, known.k2], dtype=np.float32)
 
 
 def _halved(image: Map, width: int, height: int) -> Map:
@@ -173,7 +174,7 @@ def _warp_row(source, x, y, z, translation, camera, inverse_depth, columns, rows
     """
     height, width = source.shape
     tx, ty, tz = translation[0], translation[1], translation[2]
-    fx, fy, cx, cy, k1 = camera[0], camera[1], camera[2], camera[3], camera[4]
+    fx, fy, cx, cy, k1, k2 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     last_u, last_v = np.float32(width - 1.001), np.float32(height - 1.001)
     end_u, end_v = np.float32(width) - half, np.float32(height) - half
@@ -183,7 +184,8 @@ def _warp_row(source, x, y, z, translation, camera, inverse_depth, columns, rows
         front = pz > np.float32(0.05)
         scale = one / (pz if front else one)
         a, b = (x[j] + w * tx) * scale, (y[j] + w * ty) * scale
-        factor = one + k1 * (a * a + b * b)
+        square = a * a + b * b
+        factor = one + square * (k1 + k2 * square)
         u, v = fx * a * factor + cx, fy * b * factor + cy
         inside[j] = one if front and u >= -half and v >= -half and u <= end_u and v <= end_v else zero
         columns[j] = min(max(u, zero), last_u)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vggt_motion.inference.sfm import focal
@@ -75,6 +77,12 @@ def rank(solved: Structure, keyframe_count: int) -> tuple[int, int, float]:
     judgement, _ = judge(solved, keyframe_count)
     sharpness = 1.0 / (1.0 + (solved.reprojection_px / _CONVINCING_REPROJECTION_PX) ** 2)
     return order.index(judgement), int(solved.registered.sum()), solved.explained * sharpness
+
+
+def focal_deviations(one: Structure, other: Structure) -> float:
+    """How far apart two solutions have the focal length, in standard deviations; 0 where one of them held it."""
+    sigma = math.hypot(one.focal_relative_sigma, other.focal_relative_sigma)
+    return abs(math.log(one.focal_over_width / other.focal_over_width)) / sigma if math.isfinite(sigma) else 0.0
 
 
 def disagreement(one: Structure, other: Structure) -> float:
