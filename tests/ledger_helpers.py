@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,11 @@ RESULT_STREAMS = {"describe": "descriptor", "predict": "submap", "register": "co
 def damage_blob(directory: Path, sha256: str, content: bytes) -> None:
     """Put other bytes in the place of a blob, wherever the ledger keeps it; nobody may serve the session."""
     with read_only(directory / "ledger.db") as reader:
-        place = reader.find_place(sha256)
+        place, is_row = reader.find_place(sha256), reader.find_content(sha256) is not None
+    if is_row:
+        with contextlib.closing(sqlite3.connect(directory / "ledger.db")) as connection, connection:
+            connection.execute("UPDATE contents SET content = ? WHERE sha256 = ?", (content, sha256))
+        return
     path = directory / "blobs" / sha256
     assert path.is_file() == (place is None), sha256
     if place is None:
@@ -33,7 +39,7 @@ def damage_blob(directory: Path, sha256: str, content: bytes) -> None:
 def stored_blobs(directory: Path) -> set[str]:
     """Every blob that is kept, whether a record refers to it or not: SHA-256, and how long each pack is."""
     with read_only(directory / "ledger.db") as reader:
-        names = {entry.sha256 for entry, _ in reader.blobs()}
+        names = {entry.sha256 for entry, _ in reader.blobs()} | {sha256 for sha256, _ in reader.contents()}
     paths = [path for path in (directory / "blobs").rglob("*") if path.is_file()]
     return names | {f"{path.name} {path.stat().st_size}" for path in paths}
 
@@ -71,6 +77,7 @@ def open_ledger(directory: Path, clock: Clock | None = None, **options: Any) -> 
     options.setdefault("new_lease_id", lambda: f"lease{next(counter)}")
     options.setdefault("policy", JobPolicy())
     options.setdefault("packed_blob_bytes", 0)  # blobs are files unless a test is about those that are not
+    options.setdefault("inline_bytes", 0)
     return Ledger(
         directory,
         input_streams={"keyframe"},

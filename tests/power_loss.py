@@ -428,7 +428,7 @@ def workload(folder: Path, log: DiskLog, *, syncs: bool) -> None:
     from vggt_motion.records import JobKind
 
     generator = random.Random(1)
-    ledger = open_ledger(folder, packed_blob_bytes=3000)
+    ledger = open_ledger(folder, packed_blob_bytes=3000, inline_bytes=600)
     for statement in ("PRAGMA wal_autocheckpoint = 12", *(() if syncs else ("PRAGMA synchronous = OFF",))):
         ledger.rows._writer.execute(statement)
     ledger.rows.read(lambda reader: reader.positions())

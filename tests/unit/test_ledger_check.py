@@ -118,14 +118,18 @@ def test_a_damaged_blob_is_named_set_aside_and_healed_by_appending_again(session
     assert check(session).is_sound
 
 
-def test_a_damaged_small_blob_is_named_set_aside_and_healed_by_appending_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("inline_bytes", [0, 100], ids=["packed", "among the rows"])
+def test_a_damaged_small_blob_is_named_set_aside_and_healed_by_appending_again(
+    tmp_path: Path, inline_bytes: int
+) -> None:
     session = tmp_path / "session"
-    ledger = open_ledger(session, packed_blob_bytes=100)
+    ledger = open_ledger(session, packed_blob_bytes=100, inline_bytes=inline_bytes)
     ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")])
     ledger.close()
     report = check(session)
     assert report.is_sound and report.blob_count == 1
-    assert report.stored_bytes == (session / "ledger.db").stat().st_size + len(b"image")
+    in_pack = 0 if inline_bytes else len(b"image")
+    assert report.stored_bytes == (session / "ledger.db").stat().st_size + in_pack
     damage_blob(session, entry(b"image").sha256, b"imagE")
     assert not check(session, repair=False).is_sound
     with pytest.raises(LedgerError, match="damaged"):
@@ -134,7 +138,7 @@ def test_a_damaged_small_blob_is_named_set_aside_and_healed_by_appending_again(t
     assert problem.startswith(f"keyframe/0 ('k0'): blob {entry(b'image').sha256} is damaged")
     (problem,) = check(session).problems
     assert "is missing" in problem
-    ledger = open_ledger(session, packed_blob_bytes=100)
+    ledger = open_ledger(session, packed_blob_bytes=100, inline_bytes=inline_bytes)
     assert ledger.store.append(record("keyframe", "k0"), [b"image"], [entry(b"image")]).was_known
     ledger.close()
     assert check(session).is_sound
@@ -283,11 +287,13 @@ def test_a_session_in_use_is_not_removed(session: Path) -> None:
 def test_a_session_comes_out_of_an_archive_as_it_went_in(session: Path, tmp_path: Path) -> None:
     ledger = open_ledger(session, packed_blob_bytes=100)  # exporting needs no lock
     ledger.store.append(record("event", "e0"), [b"small"], [entry(b"small")])
+    ledger.store._inline_bytes = 100
+    ledger.store.append(record("event", "e1"), [b"row"], [entry(b"row")])
     report = export_session(session, tmp_path / "session.tar")
     ledger.store.append(record("keyframe", "k2"))
     rows = ledger.store.read("keyframe", limit=2)
     ledger.close()
-    assert (report.record_counts, report.blob_count) == ({"keyframe": 2, "submap": 1, "event": 1}, 3)
+    assert (report.record_counts, report.blob_count) == ({"keyframe": 2, "submap": 1, "event": 2}, 4)
     assert report.archive_bytes == (tmp_path / "session.tar").stat().st_size
     assert import_session(tmp_path / "session.tar", tmp_path / "copy") == report
     assert check(tmp_path / "copy").is_sound
@@ -295,6 +301,7 @@ def test_a_session_comes_out_of_an_archive_as_it_went_in(session: Path, tmp_path
     assert copy.store.read("keyframe") == rows
     assert copy.store.blob(entry(b"image").sha256) == b"image"
     assert copy.store.blob(entry(b"small").sha256) == b"small"
+    assert copy.store.blob(entry(b"row").sha256) == b"row"
     assert copy.jobs.counts() == {("predict", "done"): 1, ("predict", "open"): 1}
     copy.close()
 

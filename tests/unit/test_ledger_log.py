@@ -262,7 +262,7 @@ def test_a_stored_row_that_changed_is_not_intact(ledger: Ledger) -> None:
         assert not is_intact(type(row)(**{**row.__dict__, **change}))
 
 
-# Small blobs in packs
+# Small blobs among the rows and in packs
 
 
 def test_small_blobs_lie_in_packs_and_large_ones_are_files(tmp_path: Path) -> None:
@@ -280,6 +280,24 @@ def test_small_blobs_lie_in_packs_and_large_ones_are_files(tmp_path: Path) -> No
     again.close()
     with pytest.raises(UnknownError):
         stored_blob(tmp_path / "session", entry(b"nothing").sha256)
+
+
+def test_what_comes_alone_stands_among_the_rows_and_more_in_a_pack(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100, inline_bytes=10)
+    pack = tmp_path / "session" / "blobs" / "packs" / "00000001.pack"
+    ledger.store.append(record("keyframe", "a"), [b"01234", b"56789"], [entry(b"01234"), entry(b"56789")])
+    assert not pack.exists() and ledger.store.sizes().blob_bytes == 0
+    ledger.store.append(record("keyframe", "b"), [b"01234", b"0123456789"], [entry(b"01234"), entry(b"0123456789")])
+    assert not pack.exists(), "what is known is not counted"
+    together = [Append(record("keyframe", name), [name.encode() * 6], [entry(name.encode() * 6)]) for name in "cd"]
+    assert [outcome for outcome in ledger.store.append_all(together) if isinstance(outcome, Exception)] == []
+    assert pack.read_bytes() == b"ccccccdddddd" and ledger.store.sizes().blob_bytes == 12
+    contents = [b"01234", b"56789", b"0123456789", b"cccccc", b"dddddd"]
+    assert [ledger.store.blob(entry(content).sha256) for content in contents] == contents
+    ledger.close()
+    assert [stored_blob(tmp_path / "session", entry(content).sha256) for content in contents] == contents
+    report = check(tmp_path / "session")
+    assert report.is_sound and report.blob_count == 5
 
 
 def test_small_blobs_of_many_threads_share_one_commit(tmp_path: Path) -> None:
@@ -357,8 +375,11 @@ def test_a_small_blob_that_is_known_is_not_stored_again(tmp_path: Path) -> None:
     ledger.close()
 
 
-def test_a_damaged_small_blob_is_noticed_set_aside_and_healed_by_appending_again(tmp_path: Path) -> None:
-    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
+@pytest.mark.parametrize("inline_bytes", [0, 100], ids=["packed", "among the rows"])
+def test_a_damaged_small_blob_is_noticed_set_aside_and_healed_by_appending_again(
+    tmp_path: Path, inline_bytes: int
+) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100, inline_bytes=inline_bytes)
     ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image")])
     damage_blob(tmp_path / "session", entry(b"image").sha256, b"imagE")
     with pytest.raises(DamagedBlobError):
@@ -523,7 +544,7 @@ def test_a_session_with_all_blobs_in_files_is_brought_up_to_date_by_looking_at_i
     assert check(folder).is_sound
 
 
-def test_small_blobs_among_the_rows_stay_there_and_heal_into_a_pack(
+def test_small_blobs_of_schema_3_stay_among_the_rows_and_heal_into_a_pack(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Schema 3 kept small blobs in a table."""

@@ -1,9 +1,9 @@
 """One session's directory: the lock, the database and the blobs, opened and closed as one.
 
 DIR/session.lock   held exclusively by the process that serves the session
-DIR/ledger.db      rows (and ledger.db-wal, ledger.db-shm while it is open)
+DIR/ledger.db      rows, and small payloads that come alone (and ledger.db-wal, ledger.db-shm while it is open)
 DIR/blobs/         large payloads by their hash
-DIR/blobs/packs/   small payloads, many in a file
+DIR/blobs/packs/   the other small payloads, many in a file
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vggt_motion.errors import LedgerError
 from vggt_motion.ledger.blobs import BlobFiles
 from vggt_motion.ledger.files import FileOperations, make_folder
 from vggt_motion.ledger.jobs import JobPolicy, JobQueue
-from vggt_motion.ledger.log import PACKED_BLOB_BYTES, Store
+from vggt_motion.ledger.log import INLINE_BYTES, PACKED_BLOB_BYTES, Store
 from vggt_motion.ledger.packs import PackFiles, read_place
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
 from vggt_motion.ledger.store import NewRecord, Transaction, UnknownError
@@ -111,6 +111,7 @@ class Ledger:
         reserve_bytes: int = 0,
         input_streams: Collection[str] = (),
         packed_blob_bytes: int = PACKED_BLOB_BYTES,
+        inline_bytes: int = INLINE_BYTES,
         policy: JobPolicy | None = None,
         result_streams: Mapping[str, str],
         dead_event: Callable[[JobReport], NewRecord],
@@ -127,6 +128,7 @@ class Ledger:
             reserve_bytes: see :class:`.log.Store`.
             input_streams: see :class:`.log.Store`.
             packed_blob_bytes: see :class:`.log.Store`.
+            inline_bytes: see :class:`.log.Store`.
             policy: see :class:`.jobs.JobQueue`.
             result_streams: see :class:`.jobs.JobQueue`.
             dead_event: see :class:`.jobs.JobQueue`.
@@ -161,6 +163,7 @@ class Ledger:
                 reserve_bytes=reserve_bytes,
                 input_streams=input_streams,
                 packed_blob_bytes=packed_blob_bytes,
+                inline_bytes=inline_bytes,
                 time_ns=time_ns,
             )
             self.jobs = JobQueue(

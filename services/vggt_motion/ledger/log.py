@@ -1,8 +1,8 @@
 """The durable log: streams of records with dense sequence numbers, appended idempotently, and the blobs they refer to.
 
-An append is acknowledged when its blobs and then its row have been forced to the disk: small blobs in a pack, whose
-sync those that come together share; large ones as files. It may be repeated at will: the same identity under the same
-id is acknowledged again with the same sequence number, another identity is refused.
+An append is acknowledged when its blobs and its row have been forced to the disk: little with the row, in one commit;
+more before it in a pack, whose sync those that come together share; large ones as files. It may be repeated at will:
+the same identity under the same id is acknowledged again with the same sequence number, another identity is refused.
 """
 
 from __future__ import annotations
@@ -51,6 +51,13 @@ Measured at 5 MB: one costs two syncs in a pack, three as a file, and half the p
 share a sync, nearly twice as many are stored.
 """
 
+INLINE_BYTES = 256 * 2**10
+"""Blobs that come together and are not longer than this in all stand among the rows.
+
+One sync in place of two for what comes alone; of what comes together less could be stored so than in packs, because a
+database writes everything twice.
+"""
+
 _STREAM = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _IDENTIFIER = re.compile(r"[!-~]+")
 
@@ -77,6 +84,7 @@ class Prepared:
 
     entries: tuple[BlobEntry, ...] = ()  # every blob that the record refers to
     places: tuple[tuple[BlobEntry, Place], ...] = ()  # where those among them lie that have been packed for it
+    contents: tuple[tuple[BlobEntry, Content], ...] = ()  # of those among them that are to be kept with the row
 
 
 _NOTHING = Prepared()
@@ -112,6 +120,7 @@ class Store:
         reserve_bytes: int = 0,
         input_streams: Collection[str] = (),
         packed_blob_bytes: int = PACKED_BLOB_BYTES,
+        inline_bytes: int = INLINE_BYTES,
         time_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Put the log's rules on top of rows and blobs.
@@ -122,7 +131,8 @@ class Store:
             packs: durable blobs, the small ones.
             reserve_bytes: free bytes below which new input is refused; everything else may use half of them.
             input_streams: the streams that bring new input, and with it more work and more data.
-            packed_blob_bytes: length up to which new blobs are packed.
+            packed_blob_bytes: length up to which new blobs are packed, or kept among the rows.
+            inline_bytes: length in all up to which those of them that come together are kept among the rows.
             time_ns: wall clock, informative.
         """
         self._rows = rows
@@ -131,6 +141,7 @@ class Store:
         self.reserve_bytes = reserve_bytes
         self._input_streams = frozenset(input_streams)
         self._packed_blob_bytes = packed_blob_bytes
+        self._inline_bytes = inline_bytes
         self._time_ns = time_ns
 
     def append(
@@ -257,7 +268,8 @@ class Store:
                     f"no blob {reference.sha256} of {reference.size_bytes} bytes, to which the record refers"
                 )
         small = {blob.entry: blob.data for blob in hashed if len(blob.data) <= self._packed_blob_bytes}
-        small_bytes = sum(entry.size_bytes for entry in small)
+        # Among the rows the write-ahead log and the database hold each for a while.
+        small_bytes = 2 * sum(entry.size_bytes for entry in small)
         if free_bytes < small_bytes:
             raise DiskFullError(f"the ledger's disk has no space for {small_bytes} bytes: {free_bytes} are left")
         large = [blob for blob in hashed if blob.entry not in small]
@@ -268,10 +280,14 @@ class Store:
         """Make the blobs of several records durable: the small ones under one sync, of the others each for itself."""
         outcomes: list[Prepared | Exception] = []
         packed: dict[BlobEntry, Place] = {}
+        inline: dict[BlobEntry, Content] = {}
         failure: VggtMotionError | None = None
         try:
             new = self._not_kept({entry: data for needs in needed for entry, data in needs.small.items()})
-            packed = dict(zip(new, self._packs.append(list(new.values())), strict=True))
+            if sum(entry.size_bytes for entry in new) <= self._inline_bytes:
+                inline = new
+            else:
+                packed = dict(zip(new, self._packs.append(list(new.values())), strict=True))
         except VggtMotionError as error:
             failure = error
         for needs in needed:
@@ -285,11 +301,12 @@ class Store:
                 outcomes.append(error)
                 continue
             places = tuple((entry, packed[entry]) for entry in needs.small if entry in packed)
-            outcomes.append(Prepared(needs.entries, places))
+            contents = tuple((entry, inline[entry]) for entry in needs.small if entry in inline)
+            outcomes.append(Prepared(needs.entries, places, contents))
         return outcomes
 
     def _not_kept(self, small: dict[BlobEntry, Content]) -> dict[BlobEntry, Content]:
-        """Those that are not in a pack yet, or damaged there: then they come back so."""
+        """Those that are not kept yet, or are damaged: then they come back so."""
         if not small:
             return small
         places, contents = self._rows.read(
@@ -299,18 +316,24 @@ class Store:
             )
         )
 
-        def is_kept(entry: BlobEntry, data: Content) -> bool:
+        missing = {}
+        for entry, data in small.items():
             place = places[entry]
-            return data == (contents[entry] if place is None else self._packs.read(place))
-
-        return {entry: data for entry, data in small.items() if not is_kept(entry, data)}
+            kept = contents[entry] if place is None else self._packs.read(place)
+            if kept != data:
+                missing[entry] = data
+                if kept is not None:
+                    set_content_aside(self._rows, self._blobs, entry.sha256, kept)
+        return missing
 
     def add(self, transaction: Transaction, record: NewRecord, prepared: Prepared = _NOTHING) -> Appended:
         """Append within a larger change; the record must be checked and its blobs prepared already."""
         known = self._find_known(transaction, record)
+        # Also of a known record: a content that was damaged comes back so.
         for entry, place in prepared.places:
-            # Also of a known record: a content that was damaged comes back so.
             transaction.set_place(entry, place)
+        for entry, content in prepared.contents:
+            transaction.set_content(entry, content)
         if known is not None:
             return Appended(known.sequence, was_known=True)
         sequence = transaction.next_sequence(record.stream)
@@ -326,9 +349,9 @@ class Store:
             row_sha256=row_digest(record, sequence, time_ns),
         )
         transaction.add_record(row)
-        placed = {entry for entry, _ in prepared.places}
+        told = {entry for entry, _ in (*prepared.places, *prepared.contents)}
         for entry in prepared.entries:
-            if entry not in placed:
+            if entry not in told:
                 transaction.add_blob(entry)
             transaction.add_reference(record.stream, sequence, entry.sha256)
         return Appended(sequence, was_known=False)
@@ -405,7 +428,7 @@ class Store:
 
 
 def set_content_aside(rows: Rows, blobs: Blobs, sha256: str, content: bytes) -> None:
-    """Forget a damaged small blob, and keep its content for a person."""
+    """Forget a damaged small blob, and keep what there is for a person."""
     blobs.keep_damaged(sha256, content)
     rows.write(lambda transaction: transaction.remove_content(sha256))
 

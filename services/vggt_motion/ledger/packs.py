@@ -1,9 +1,9 @@
 """Small blobs one behind the other in files of their own: ``blobs/packs/00000001.pack``.
 
-A file for each would cost two syncs and a name; among the rows each would be written twice, to the write-ahead log and
-to the database. Here many share one sync. A pack holds contents and nothing else: which blob lies where stands in the
-rows, and they refer to a place only after what lies there has been forced to the disk. So nobody refers to what was
-torn; the next writer goes on behind it, and a check cuts it off where it is the end.
+A file for each would cost two syncs and a name; among the rows each is written twice, to the write-ahead log and to the
+database. Here many share one sync. A pack holds contents and nothing else: which blob lies where stands in the rows,
+and they refer to a place only after what lies there has been forced to the disk. So nobody refers to what was torn; the
+next writer goes on behind it, and a check cuts it off where it is the end.
 """
 
 from __future__ import annotations

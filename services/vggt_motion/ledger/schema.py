@@ -66,7 +66,7 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         "ALTER TABLE blobs ADD COLUMN is_file INTEGER NOT NULL DEFAULT 1",
     ),
     (
-        # Small blobs lie in packs: among the rows each was written twice. What stands there already stays.
+        # Small blobs that come many together lie in packs: among the rows each is written twice.
         "ALTER TABLE blobs ADD COLUMN pack BIGINT NOT NULL DEFAULT 0",
         "ALTER TABLE blobs ADD COLUMN offset_bytes BIGINT NOT NULL DEFAULT 0",
     ),

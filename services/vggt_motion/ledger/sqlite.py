@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 
 from vggt_motion.errors import DiskFullError, LedgerError, VggtMotionError
 from vggt_motion.ledger.schema import MIGRATIONS, SCHEMA_VERSION
-from vggt_motion.ledger.store import BlobEntry, JobRow, LeaseRow, Place, Reader, RecordRow, Transaction
+from vggt_motion.ledger.store import BlobEntry, Content, JobRow, LeaseRow, Place, Reader, RecordRow, Transaction
 from vggt_motion.records import JobState
 
 T = TypeVar("T")
@@ -164,11 +164,26 @@ class _Statements:
     def set_place(self, entry: BlobEntry, place: Place) -> None:
         self._run(
             """INSERT INTO blobs (sha256, size_bytes, pack, offset_bytes) VALUES (?, ?, ?, ?)
-            ON CONFLICT (sha256) DO UPDATE SET pack = excluded.pack, offset_bytes = excluded.offset_bytes""",
+            ON CONFLICT (sha256)
+            DO UPDATE SET is_file = 1, pack = excluded.pack, offset_bytes = excluded.offset_bytes""",
             entry.sha256,
             entry.size_bytes,
             place.pack,
             place.offset_bytes,
+        )
+
+    def set_content(self, entry: BlobEntry, content: Content) -> None:
+        self._run(
+            """INSERT INTO contents (sha256, content) VALUES (?, ?)
+            ON CONFLICT (sha256) DO UPDATE SET content = excluded.content""",
+            entry.sha256,
+            content,
+        )
+        self._run(
+            """INSERT INTO blobs (sha256, size_bytes, is_file) VALUES (?, ?, 0)
+            ON CONFLICT (sha256) DO UPDATE SET is_file = 0, pack = 0, offset_bytes = 0""",
+            entry.sha256,
+            entry.size_bytes,
         )
 
     def remove_content(self, sha256: str) -> None:

@@ -164,7 +164,7 @@ class Reader(Protocol):
         """Where the blob lies if it is in a pack."""
 
     def find_content(self, sha256: str) -> bytes | None:
-        """The content of a blob that an older version kept among the rows; not verified."""
+        """The content of a blob that is kept among the rows; not verified."""
 
     def has_content(self, sha256: str, size_bytes: int) -> bool:
         """Whether it is there with this size."""
@@ -221,6 +221,9 @@ class Transaction(Reader, Protocol):
 
     def set_place(self, entry: BlobEntry, place: Place) -> None:
         """Insert a blob that lies in a pack, or say where it lies now."""
+
+    def set_content(self, entry: BlobEntry, content: Content) -> None:
+        """Insert a blob with its content, or replace that."""
 
     def remove_content(self, sha256: str) -> None:
         """Forget the content of a blob among the rows, or its place in a pack."""
@@ -308,7 +311,7 @@ class Blobs(Protocol):
 
 
 class Packs(Protocol):
-    """Durable bytes at places that the rows know: those that are too small for a file of their own."""
+    """Durable bytes at places that the rows know: those that are too small for a file and too much for the rows."""
 
     def append(self, contents: Sequence[Content]) -> list[Place]:
         """Make contents durable, in order; durable on return, under one sync.
