@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import itertools
 import logging
@@ -27,6 +26,7 @@ from typing import Final
 from vggt_motion.bus import calls, codec
 from vggt_motion.config import BusConfig
 from vggt_motion.errors import BusUnavailableError, CodecError
+from vggt_motion.locks import try_lock
 
 _log = logging.getLogger(__name__)
 
@@ -254,7 +254,7 @@ def _joined(folder: Path, prefix: str) -> int:
             descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except FileNotFoundError:
             continue  # the last one of before has just left
-        if _try_lock(descriptor) and lock.exists():
+        if try_lock(descriptor) and lock.exists():
             return descriptor
         os.close(descriptor)  # somebody cleared it up before it was held
     raise OSError(errno.EAGAIN, "others keep clearing it up", str(folder))
@@ -272,17 +272,9 @@ def _clear_up(folder: Path) -> None:
         for lock in folder.glob("*.lock"):
             descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
             try:
-                if _try_lock(descriptor):
+                if try_lock(descriptor):
                     for path in (*folder.glob(f"{lock.stem}-*"), lock):
                         path.unlink(missing_ok=True)
             finally:
                 os.close(descriptor)
         folder.rmdir()
-
-
-def _try_lock(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

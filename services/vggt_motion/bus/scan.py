@@ -10,6 +10,7 @@ from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
 
+from vggt_motion.bus.wire import DELIMITED, MalformedError, fields
 from vggt_motion.errors import CodecError
 
 SCANNED_FROM_BYTES = 2**20  # shorter messages cannot hurt
@@ -17,7 +18,6 @@ MAX_ELEMENTS = 2**19
 MAX_STRUCTURE_BYTES = 32 * 2**20
 _OPAQUE_FROM_BYTES = 2**12
 _DESCEND_FROM_BYTES = 2**16
-_VARINT, _FIXED64, _DELIMITED, _FIXED32 = 0, 1, 2, 5
 
 
 def check_structure(payload: bytes, descriptor: Any) -> None:
@@ -36,51 +36,23 @@ class _Scan:
         self._elements = 0
         self._structure_bytes = 0
 
-    def message(self, data: bytes, position: int, end: int, descriptor: Any) -> None:
-        fields = descriptor.fields_by_number if descriptor is not None else {}
-        while position < end:
-            begin = position
-            tag, position = self._varint(data, position, end)
-            if tag >> 3 == 0:
-                raise self._malformed()
-            kind = tag & 7
-            opaque_bytes = 0
-            if kind == _VARINT:
-                _, position = self._varint(data, position, end)
-            elif kind == _FIXED64:
-                position += 8
-            elif kind == _FIXED32:
-                position += 4
-            elif kind == _DELIMITED:
-                length, position = self._varint(data, position, end)
-                if length > end - position:
-                    raise self._malformed()
-                field = fields.get(tag >> 3)
-                if field is not None and field.type == FieldDescriptor.TYPE_MESSAGE and length >= _DESCEND_FROM_BYTES:
-                    self.message(data, position, position + length, field.message_type)
-                    opaque_bytes = length  # counted inside
-                elif length >= _OPAQUE_FROM_BYTES and (field is None or field.type == FieldDescriptor.TYPE_BYTES):
-                    opaque_bytes = length
-                position += length
-            else:
-                raise self._malformed()
-            self._elements += 1
-            self._structure_bytes += position - begin - opaque_bytes
-            if self._elements > MAX_ELEMENTS or self._structure_bytes > MAX_STRUCTURE_BYTES:
-                raise CodecError(f"{self._name}: has too many elements")
-        if position != end:
-            raise self._malformed()
-
-    def _varint(self, data: bytes, position: int, end: int) -> tuple[int, int]:
-        value = shift = 0
-        while position < end and shift < 70:
-            byte = data[position]
-            position += 1
-            value |= (byte & 0x7F) << shift
-            if byte < 0x80:
-                return value, position
-            shift += 7
-        raise self._malformed()
-
-    def _malformed(self) -> CodecError:
-        return CodecError(f"{self._name}: not a valid message: malformed wire format")
+    def message(self, data: bytes, begin: int, end: int, descriptor: Any) -> None:
+        known = descriptor.fields_by_number if descriptor is not None else {}
+        try:
+            for found in fields(data, begin, end):
+                length = found.end - found.content
+                opaque_bytes = 0
+                if found.kind == DELIMITED:
+                    field = known.get(found.number)
+                    kind = FieldDescriptor.TYPE_BYTES if field is None else field.type
+                    if field is not None and kind == FieldDescriptor.TYPE_MESSAGE and length >= _DESCEND_FROM_BYTES:
+                        self.message(data, found.content, found.end, field.message_type)
+                        opaque_bytes = length  # counted inside
+                    elif length >= _OPAQUE_FROM_BYTES and kind == FieldDescriptor.TYPE_BYTES:
+                        opaque_bytes = length
+                self._elements += 1
+                self._structure_bytes += found.end - found.begin - opaque_bytes
+                if self._elements > MAX_ELEMENTS or self._structure_bytes > MAX_STRUCTURE_BYTES:
+                    raise CodecError(f"{self._name}: has too many elements")
+        except MalformedError:
+            raise CodecError(f"{self._name}: not a valid message: malformed wire format") from None

@@ -17,6 +17,8 @@ import numpy as np
 from google.protobuf.internal.enum_type_wrapper import EnumTypeWrapper
 from google.protobuf.message import Message
 
+from vggt_motion.bus.wire import delimited
+
 _CONTROL = re.compile("[\x00-\x1f\x7f\x85\u2028\u2029]")
 _CONTROL_BUT_LINES = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
@@ -452,14 +454,3 @@ class Plan:
         problem = self._test(record)
         if problem is not None:
             raise FieldError(problem)
-
-
-def delimited(number: int, length: int) -> bytes:
-    """Tag and length of a field that is delimited by its length (protobuf, "Encoding")."""
-    out = bytearray()
-    for value in (number << 3 | 2, length):
-        while value > 0x7F:
-            out.append(value & 0x7F | 0x80)
-            value >>= 7
-        out.append(value)
-    return bytes(out)

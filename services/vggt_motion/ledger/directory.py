@@ -9,7 +9,6 @@ DIR/blobs/packs/   the other small payloads, many in a file
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import time
 import uuid
@@ -25,6 +24,7 @@ from vggt_motion.ledger.log import INLINE_BYTES, PACKED_BLOB_BYTES, Store
 from vggt_motion.ledger.packs import PackFiles, read_place
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
 from vggt_motion.ledger.store import NewRecord, Transaction, UnknownError
+from vggt_motion.locks import try_lock
 from vggt_motion.records import JobReport
 
 DATABASE_NAME: Final = "ledger.db"
@@ -54,7 +54,7 @@ class SessionLock:
         except OSError as error:
             raise LedgerError(f"cannot write to {directory}: {error.strerror or error}") from error
         end_s = time.monotonic() + patience_s
-        while not _try_lock(self._descriptor):
+        while not try_lock(self._descriptor):
             if time.monotonic() < end_s:
                 time.sleep(0.02)
                 continue
@@ -78,17 +78,9 @@ def is_in_use(directory: Path) -> bool:
     except OSError:
         return False
     try:
-        return not _try_lock(descriptor)
+        return not try_lock(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _try_lock(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 @contextlib.contextmanager
