@@ -129,6 +129,35 @@ def test_a_segment_without_its_keyframes_waits() -> None:
     assert planner.next_jobs(state, CONFIG) == []
 
 
+@settings(max_examples=200, deadline=None)
+@given(data=st.data())
+def test_what_is_complete_lacks_nothing_however_far_each_stream_has_been_read(data: st.DataObject) -> None:
+    """A backend that starts again reads the streams side by side: the event that ends the input may come first."""
+    full = started(4)
+    run(full, random.Random(data.draw(st.integers(0, 5))), dead_share=data.draw(st.sampled_from([0.0, 0.3])))
+    assert planner.is_complete(full, CONFIG)
+    partial = LogState()
+    for stream in (full.keyframes, full.segments, full.submaps, full.constraints, full.events):
+        records = list(stream.values())
+        for record in records[: data.draw(st.integers(0, len(records)) | st.just(len(records)))]:
+            partial.apply(record)
+    if planner.is_complete(partial, CONFIG):
+        assert partial.usable_submaps().keys() == full.usable_submaps().keys()
+        assert planner.current_constraints(partial) == planner.current_constraints(full)
+
+
+def test_nothing_is_complete_while_its_keyframes_and_submaps_are_on_their_way() -> None:
+    full = started(3)
+    run(full, random.Random(1))
+    partial = LogState(segments=dict(full.segments), events=dict(full.events), constraints=dict(full.constraints))
+    assert planner.next_jobs(partial, CONFIG) == []
+    assert not planner.is_complete(partial, CONFIG)
+    partial.submaps.update(full.submaps)
+    assert not planner.is_complete(partial, CONFIG)
+    partial.keyframes.update(full.keyframes)
+    assert planner.is_complete(partial, CONFIG)
+
+
 def test_the_hint_of_submap_k_folds_submaps_0_to_k_minus_3() -> None:
     state = started(6)
     first = planner.next_jobs(state, CONFIG)

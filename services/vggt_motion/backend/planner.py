@@ -75,8 +75,16 @@ def next_jobs(state: LogState, config: Config) -> list[PlannedJob]:
 
 
 def is_complete(state: LogState, config: Config) -> bool:
-    """Whether the input is closed and no job is left to do: time for the final solve."""
-    return state.is_input_complete and not next_jobs(state, config)
+    """Whether the input is closed and no job is left to do: time for the final solve.
+
+    The streams are followed apart: while keyframes or submaps are on their way, there may be nothing to do yet.
+    """
+    return (
+        state.is_input_complete
+        and not state.awaited_keyframes()
+        and all(_is_resolved(state, composition, 1) for composition in _all_compositions(state, config))
+        and not next_jobs(state, config)
+    )
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,15 @@ class LogState:
         """Indices of the closed segments that no submap came of yet."""
         return self.segments.keys() - {segment_index_of(index) for index, _ in self.submaps}
 
+    def awaited_keyframes(self) -> set[str]:
+        """Keyframes that a segment names and that have not come."""
+        named = (
+            keyframe_id
+            for segment in self.segments.values()
+            for keyframe_id in (*segment.overlap_keyframe_ids, *segment.base_keyframe_ids)
+        )
+        return {keyframe_id for keyframe_id in named if keyframe_id not in self.keyframes}
+
     def latest_graph(self) -> GraphUpdate | None:
         """The final graph, or else the newest live one."""
         return next(iter(self.graphs.values()), None)
