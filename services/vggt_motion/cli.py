@@ -176,9 +176,13 @@ def _leave(code: int) -> NoReturn:
     take seconds, or abort it ("exception not rethrown", seen in 2 of 40 ends of the ledger).
     """
     logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+    try:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except OSError:
+        code = code or 1  # whoever read our output has gone
+    finally:
+        os._exit(code)
 
 
 def _needed(value: Value | None, service: str, option: str) -> Value:

@@ -236,7 +236,11 @@ class LocalRun:
         environment = {"VGGT_MOTION_GATEWAY__TOKEN": token} if token is not None else {}
         commands = service_commands(request, config_file)
         begin = time.monotonic()
-        with self._interruptible(), Supervisor(commands, request.out / LOG_FOLDER, environment) as supervisor:
+        with (
+            self._kept_port,
+            self._interruptible(),
+            Supervisor(commands, request.out / LOG_FOLDER, environment) as supervisor,
+        ):
             supervisor.start([command.label for command in commands if command.name != "frontend"])
             bus = self._join(supervisor)
             try:
@@ -257,7 +261,6 @@ class LocalRun:
                     finish(outcome, bus)
             finally:
                 bus.close()
-        self._kept_port.close()
         return outcome
 
     @contextlib.contextmanager

@@ -152,8 +152,7 @@ def test_an_answer_that_cannot_be_read_is_no_answer(endpoint: str, monkeypatch: 
         monkeypatch.setattr(MemoryParcels, "leave_answer", lose)
         with pytest.raises(BusUnavailableError, match="cannot be read"):
             client.request(client.keys.rpc("test", "reverse"), payload(1))
-        monkeypatch.undo()
-        assert client.request(client.keys.rpc("test", "reverse"), payload(2)) == payload(2)[::-1]
+        assert client.request(client.keys.rpc("test", "reverse"), payload(2)) == payload(2)[::-1], "by messages now"
 
 
 def test_what_a_killed_answerer_left_goes_when_the_next_one_joins(endpoint: str, tmp_path: Path) -> None:

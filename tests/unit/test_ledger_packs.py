@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import itertools
+import os
 import threading
 import time
 from collections.abc import Sequence
@@ -11,10 +13,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ledger_helpers import damage_blob, open_ledger, record
 from vggt_motion.errors import DiskFullError, LedgerError
 from vggt_motion.ledger.files import FileOperations
+from vggt_motion.ledger.log import set_content_aside
 from vggt_motion.ledger.packs import PackFiles, read_place
-from vggt_motion.ledger.store import Place
+from vggt_motion.ledger.store import BlobEntry, DamagedBlobError, Place, UnknownError
 
 
 @given(batches=st.lists(st.lists(st.binary(max_size=300), max_size=6), max_size=6), max_bytes=st.integers(1, 500))
@@ -101,6 +105,103 @@ def test_nothing_goes_behind_a_sync_that_failed(tmp_path: Path) -> None:
     assert (before.pack, after) == (1, Place(2, 0, 7))
     assert (packs.read(before), packs.read(after)) == (b"before", b"content")
     packs.close()
+
+
+def test_who_wrote_behind_a_sync_that_failed_is_not_told_that_all_is_well(tmp_path: Path) -> None:
+    class FailsOnce(BrokenFiles):
+        def __init__(self) -> None:
+            self.release = threading.Event()
+            self.sync_count = 0
+
+        def sync_data(self, path: Path, descriptor: int) -> None:
+            self.sync_count += 1
+            if self.sync_count == 1:
+                self.release.wait(10)
+                raise OSError(errno.EIO, "injected")
+            super().sync_data(path, descriptor)
+
+    files = FailsOnce()
+    packs = PackFiles(tmp_path / "packs", files=files)
+    outcomes: dict[int, object] = {}
+
+    def append(number: int) -> None:
+        try:
+            outcomes[number] = packs.append([b"%d" % number])
+        except LedgerError as error:
+            outcomes[number] = error
+
+    threads = [threading.Thread(target=append, args=(number,)) for number in range(4)]
+    threads[0].start()
+    while files.sync_count == 0:
+        time.sleep(0.001)
+    for thread in threads[1:]:
+        thread.start()
+    while packs._open[1]._shared_sync._asked < 4:
+        time.sleep(0.001)
+    files.release.set()
+    for thread in threads:
+        thread.join()
+    assert [type(outcomes[number]) for number in range(4)] == [LedgerError] * 4
+    assert packs.append([b"later"]) == [Place(2, 0, 5)]
+    packs.close()
+
+
+def test_a_part_of_the_disk_that_cannot_be_read_is_as_damaged_as_any(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
+    entries = {data: BlobEntry(hashlib.sha256(data).hexdigest(), len(data)) for data in (b"lost", b"kept")}
+    for data, entry in entries.items():
+        ledger.store.append(record("keyframe", data.decode()), [data], [entry])
+    real = os.pread
+
+    def pread(descriptor: int, length: int, offset: int) -> bytes:
+        if offset == 0:
+            raise OSError(errno.EIO, "injected")
+        return real(descriptor, length, offset)
+
+    monkeypatch.setattr("vggt_motion.ledger.packs.os.pread", pread)
+    with pytest.raises(DamagedBlobError):
+        ledger.store.blob(entries[b"lost"].sha256)
+    assert ledger.store.blob(entries[b"kept"].sha256) == b"kept"
+    assert ledger.store.append(record("keyframe", "lost"), [b"lost"], [entries[b"lost"]]).was_known
+    assert ledger.store.blob(entries[b"lost"].sha256) == b"lost"
+    ledger.close()
+
+
+def test_a_known_record_whose_pack_is_gone_is_not_acknowledged_without_its_blob(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
+    entry = BlobEntry(hashlib.sha256(b"image").hexdigest(), 5)
+    ledger.store.append(record("keyframe", "a"), [b"image"], [entry])
+    ledger.close()
+    (tmp_path / "session" / "blobs" / "packs" / "00000001.pack").unlink()
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
+    with pytest.raises(UnknownError):
+        ledger.store.append(record("keyframe", "b"), [], [entry])
+    assert ledger.store.append(record("keyframe", "a"), [b"image"], [entry]).was_known
+    assert ledger.store.blob(entry.sha256) == b"image"
+    ledger.close()
+
+
+def test_setting_aside_what_was_damaged_leaves_what_has_come_back(tmp_path: Path) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
+    entry = BlobEntry(hashlib.sha256(b"image").hexdigest(), 5)
+    ledger.store.append(record("keyframe", "a"), [b"image"], [entry])
+    damage_blob(tmp_path / "session", entry.sha256, b"imagE")
+    ledger.store.append(record("keyframe", "b"), [b"image"], [entry])
+    set_content_aside(ledger.rows, ledger.blobs, entry.sha256, b"imagE", Place(1, 0, 5))
+    assert ledger.store.blob(entry.sha256) == b"image"
+    ledger.close()
+
+
+def test_after_the_end_nothing_is_written_into_what_may_be_somebody_elses(tmp_path: Path) -> None:
+    packs = PackFiles(tmp_path / "packs")
+    (place,) = packs.append([b"abc"])
+    packs.close()
+    for call in (lambda: packs.append([b"more"]), lambda: packs.read(place)):
+        with pytest.raises(LedgerError, match="the session is closed"):
+            call()
+    assert (tmp_path / "packs" / "00000001.pack").read_bytes() == b"abc"
 
 
 def test_callers_at_the_same_time_share_a_sync(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -138,13 +139,17 @@ def test_answers_that_nobody_takes_are_removed_after_a_while(
     sides: tuple[MemoryParcels, MemoryParcels], memory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = memory / "vggt_motion-0-session"
-    first = sides[0].leave_answer(LONG)
-    assert first is not None
-    sides[0].leave_answer(LONG)
-    assert len(left_in(folder)) == 2
-    monkeypatch.setattr(parcels.time, "monotonic", lambda: first.ends_s + 1.0)
-    third = sides[0].leave_answer(LONG)
-    assert third is not None and left_in(folder) == [codec.decode(calls.Parcel, third.attachment).name]
+    monkeypatch.setattr(parcels, "_ANSWER_LIFE_S", 0.2)
+    for _ in range(2):
+        assert sides[0].leave_answer(LONG) is not None
+    kept = sides[0].leave(LONG)
+    assert kept is not None and len(left_in(folder)) == 3
+    deadline = time.monotonic() + 20.0
+    while len(left_in(folder)) > 1:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    monkeypatch.undo()
+    assert sides[0].leave_answer(LONG) is not None
     sides[0].close()
     assert left_in(folder) == []
 
@@ -188,6 +193,34 @@ def test_a_folder_that_others_may_open_is_not_used(memory: Path, caplog: pytest.
     folder.unlink()
     assert type(open_parcels(config.model_copy(update={"local_parcels": False}))) is Parcels
     assert list(memory.iterdir()) == []
+
+
+def test_a_link_in_the_place_of_a_folder_leads_nowhere(memory: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Anybody may make one: whose name it bears is not whose it is."""
+    precious = tmp_path_factory.mktemp("home")
+    (precious / "uv.lock").write_text("mine")
+    (precious / "uv-build.toml").write_text("mine")
+    (memory / f"vggt_motion-{os.geteuid()}-x").symlink_to(precious)
+    opened = open_parcels(BusConfig())
+    assert isinstance(opened, MemoryParcels)
+    (folder,) = (path for path in memory.iterdir() if not path.is_symlink())
+    (folder / "other.lock").symlink_to(precious / "uv.lock")
+    opened.close()
+    assert sorted(path.name for path in precious.iterdir()) == ["uv-build.toml", "uv.lock"]
+
+
+def test_a_parcel_that_meets_the_end_of_its_owner_is_not_left_behind(
+    sides: tuple[MemoryParcels, MemoryParcels], memory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = parcels._write
+
+    def closing(path: Path, payload: bytes) -> None:
+        sides[0].close()
+        real(path, payload)
+
+    monkeypatch.setattr(parcels, "_write", closing)
+    assert sides[0].leave(LONG) is None
+    assert left_in(memory / "vggt_motion-0-session") == []
 
 
 def test_sessions_and_endpoints_have_folders_of_their_own(memory: Path) -> None:

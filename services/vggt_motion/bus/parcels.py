@@ -121,9 +121,15 @@ class MemoryParcels(Parcels):
         self._numbers = itertools.count()
         self._lock = threading.Lock()
         self._answers: deque[Parcel] = deque()
+        self._timer: threading.Timer | None = None  # that removes the oldest answer when its time is over
         self._is_closed = False
         self._lock_descriptor = _joined(folder, self._prefix)
-        self._folder_id = _identity(folder)
+        try:
+            self._folder_id = _identity(folder)
+        except OSError:
+            os.close(self._lock_descriptor)
+            _clear_up(folder)
+            raise
         self.greeting = codec.encode(calls.Parcel(self._folder_id))
         _clear_up(folder)
         for other in folder.parent.glob(f"{folder.name.rsplit('-', 1)[0]}-*"):
@@ -140,6 +146,8 @@ class MemoryParcels(Parcels):
             if space.f_bavail * space.f_frsize < _KEPT_FREE * len(payload):
                 return None
             _write(path, payload)
+            if self._is_closed:
+                raise OSError(errno.EBADF, "closed meanwhile")
         except OSError as error:
             with contextlib.suppress(OSError):
                 path.unlink()
@@ -149,17 +157,12 @@ class MemoryParcels(Parcels):
 
     def leave_answer(self, payload: bytes) -> Parcel | None:
         """See :meth:`Parcels.leave_answer`."""
-        now_s = time.monotonic()
-        overdue = []
-        with self._lock:
-            while self._answers and self._answers[0].ends_s < now_s:
-                overdue.append(self._answers.popleft())
-        for old in overdue:
-            old.remove()
         parcel = self.leave(payload)
         if parcel is not None:
             with self._lock:
                 self._answers.append(parcel)
+                if self._timer is None:
+                    self._start_timer(_ANSWER_LIFE_S)
         return parcel
 
     def is_near(self, attachment: bytes | None) -> bool:
@@ -192,12 +195,31 @@ class MemoryParcels(Parcels):
             if self._is_closed:
                 return
             self._is_closed = True
+            if self._timer is not None:
+                self._timer.cancel()
             answers = list(self._answers)
             self._answers.clear()
         for parcel in answers:
             parcel.remove()
         os.close(self._lock_descriptor)
         _clear_up(self._folder)
+
+    def _start_timer(self, seconds: float) -> None:
+        self._timer = threading.Timer(max(0.0, seconds), self._remove_overdue)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _remove_overdue(self) -> None:
+        now_s = time.monotonic()
+        overdue: list[Parcel] = []
+        with self._lock:
+            while self._answers and self._answers[0].ends_s <= now_s:
+                overdue.append(self._answers.popleft())
+            self._timer = None
+            if self._answers and not self._is_closed:
+                self._start_timer(self._answers[0].ends_s - now_s)
+        for parcel in overdue:
+            parcel.remove()
 
     def _parcel(self, attachment: bytes) -> calls.Parcel | None:
         try:
@@ -247,17 +269,21 @@ def _joined(folder: Path, prefix: str) -> int:
     for _ in range(_JOIN_ATTEMPTS):
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
-            raise PermissionError(errno.EPERM, "not a folder of our own", str(folder))
         try:
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            _check_own(folder)
+            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         except FileNotFoundError:
             continue  # the last one of before has just left
         if try_lock(descriptor) and lock.exists():
             return descriptor
         os.close(descriptor)  # somebody cleared it up before it was held
     raise OSError(errno.EAGAIN, "others keep clearing it up", str(folder))
+
+
+def _check_own(folder: Path) -> None:
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        raise PermissionError(errno.EPERM, "not a folder of our own", str(folder))
 
 
 def _identity(folder: Path) -> str:
@@ -269,12 +295,18 @@ def _identity(folder: Path) -> str:
 def _clear_up(folder: Path) -> None:
     """Remove what processes that are gone have left, and the folder if nobody uses it."""
     with contextlib.suppress(OSError):
+        _check_own(folder)  # the name alone says nothing: anybody may make a link of it
         for lock in folder.glob("*.lock"):
-            descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
-            try:
-                if try_lock(descriptor):
-                    for path in (*folder.glob(f"{lock.stem}-*"), lock):
-                        path.unlink(missing_ok=True)
-            finally:
-                os.close(descriptor)
+            with contextlib.suppress(OSError):  # of one, which somebody else may be clearing up
+                _clear_up_after(folder, lock)
         folder.rmdir()
+
+
+def _clear_up_after(folder: Path, lock: Path) -> None:
+    descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        if try_lock(descriptor):
+            for path in (*folder.glob(f"{lock.stem}-*"), lock):
+                path.unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)

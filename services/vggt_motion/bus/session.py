@@ -19,7 +19,7 @@ from zenoh import handlers
 
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.keys import Keys
-from vggt_motion.bus.parcels import open_parcels
+from vggt_motion.bus.parcels import Parcels, open_parcels
 from vggt_motion.bus.pubsub import (
     MAX_PAYLOAD_BYTES,
     Closable,
@@ -48,6 +48,8 @@ _ATTEMPT_S = 1.0
 _RETRY_S = 0.2
 _CLOSE_S = 1.0
 _HANDLERS_S = 0.3
+_MESSAGES_ONLY_S = 30.0
+_NO_PARCELS = Parcels()
 Kept = TypeVar("Kept", bound=Closable)
 
 
@@ -136,6 +138,7 @@ class Bus:
         self._session = session
         self._parcels = open_parcels(config)
         self._near_keys: set[str] = set()  # who answered there last takes parcels
+        self._messages_until_s = 0.0  # after a parcel that came to nothing
         self._lock = threading.Lock()
         self._requests: set[zenoh.CancellationToken] = set()
         self._closables: list[Closable] = []
@@ -163,25 +166,42 @@ class Bus:
         """
         if len(payload) > MAX_PAYLOAD_BYTES:
             raise BusError(f"{key}: a request of {len(payload)} bytes is longer than the bus carries")
+        timeout = self.config.request_timeout_s if timeout_s is None else timeout_s
+        parcels = self._parcels if time.monotonic() >= self._messages_until_s else _NO_PARCELS
+        parcel = parcels.leave(payload) if key in self._near_keys else None
+        is_by_parcel = parcel is not None
         try:
-            return self._ask(key, payload, self.config.request_timeout_s if timeout_s is None else timeout_s)
+            if parcel is None:
+                sample = self._ask(key, payload, parcels.greeting, timeout)
+            else:
+                sample = self._ask(key, b"", parcel.attachment, timeout)
+            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
+            if payload and self._parcels.is_near(attachment):
+                self._near_keys.add(key)
+            is_by_parcel |= self._parcels.size_bytes(attachment) > 0
+            return self._parcels.take(sample.payload.to_bytes(), attachment, is_last_reader=True)
         except BusUnavailableError:
-            self._near_keys.discard(key)  # the next attempt is a message, whoever answers it
+            if is_by_parcel:
+                # Whatever the reason was: the next attempts go without, and so does what answers them.
+                self._messages_until_s = time.monotonic() + _MESSAGES_ONLY_S
             raise
+        finally:
+            if parcel is not None:
+                parcel.remove()
 
-    def _ask(self, key: str, payload: bytes, timeout: float) -> bytes:
+    def _ask(self, key: str, payload: bytes, attachment: bytes | None, timeout: float) -> zenoh.Sample:
+        """Send a query and wait for its one answer."""
         token = zenoh.CancellationToken()
         with self._lock:
             if self._interrupted.is_set():
                 raise BusUnavailableError(f"{key}: stopping")
             self._requests.add(token)
-        parcel = self._parcels.leave(payload) if key in self._near_keys else None
         try:
             replies: Any = self._session.get(
                 key,
                 handlers.FifoChannel(2),
-                payload=payload if parcel is None else b"",
-                attachment=self._parcels.greeting if parcel is None else parcel.attachment,
+                payload=payload,
+                attachment=attachment,
                 timeout=timeout,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -196,14 +216,9 @@ class Bus:
         finally:
             with self._lock:
                 self._requests.discard(token)
-            if parcel is not None:
-                parcel.remove()
         if reply.ok is not None:
-            sample = reply.ok
-            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
-            if payload and self._parcels.is_near(attachment):
-                self._near_keys.add(key)
-            return self._parcels.take(sample.payload.to_bytes(), attachment, is_last_reader=True)
+            sample: zenoh.Sample = reply.ok
+            return sample
         error = reply.err
         if str(error.encoding) != REFUSAL_ENCODING:  # Zenoh's own, such as a timeout
             raise BusUnavailableError(f"{key}: no answer within {timeout:g} s ({error.payload.to_bytes()[:80]!r})")

@@ -227,7 +227,7 @@ def _check_blobs(
             continue
         if content is not None:
             if repair:
-                set_content_aside(rows, blobs, sha256, content)
+                set_content_aside(rows, blobs, sha256, content, place)
             findings.problem(
                 f"{name}: blob {sha256} is damaged (another content); appending the record again brings it back"
             )

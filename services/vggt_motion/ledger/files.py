@@ -42,7 +42,7 @@ class FileOperations:
 
     def sync_data(self, path: Path, descriptor: int) -> None:
         """Force the content and the length of the open file ``path`` to the disk."""
-        os.fdatasync(descriptor)
+        getattr(os, "fdatasync", os.fsync)(descriptor)  # macOS has the second only
 
     def rename(self, source: Path, target: Path) -> None:
         """Move a file within the file system, atomically; replaces ``target``."""

@@ -323,7 +323,7 @@ class Store:
             if kept != data:
                 missing[entry] = data
                 if kept is not None:
-                    set_content_aside(self._rows, self._blobs, entry.sha256, kept)
+                    set_content_aside(self._rows, self._blobs, entry.sha256, kept, place)
         return missing
 
     def add(self, transaction: Transaction, record: NewRecord, prepared: Prepared = _NOTHING) -> Appended:
@@ -387,7 +387,7 @@ class Store:
         if content is None:
             return self._blobs.get(sha256)
         if sha256_hex(content) != sha256:
-            set_content_aside(self._rows, self._blobs, sha256, content)
+            set_content_aside(self._rows, self._blobs, sha256, content, place)
             raise DamagedBlobError(f"blob {sha256} is damaged: {len(content)} bytes with another hash")
         return content
 
@@ -423,14 +423,20 @@ class Store:
             lambda reader: (reader.find_place(entry.sha256), reader.has_content(entry.sha256, entry.size_bytes))
         )
         if place is not None:
-            return place.size_bytes == entry.size_bytes
+            return place.size_bytes == entry.size_bytes and self._packs.has(place)
         return is_row or self._blobs.has(entry.sha256, entry.size_bytes)
 
 
-def set_content_aside(rows: Rows, blobs: Blobs, sha256: str, content: bytes) -> None:
-    """Forget a damaged small blob, and keep what there is for a person."""
+def set_content_aside(rows: Rows, blobs: Blobs, sha256: str, content: bytes, place: Place | None) -> None:
+    """Forget a small blob that is damaged where it was read, and keep what there is for a person.
+
+    Only there: it may have come back meanwhile.
+    """
     blobs.keep_damaged(sha256, content)
-    rows.write(lambda transaction: transaction.remove_content(sha256))
+    if place is None:
+        rows.write(lambda transaction: transaction.remove_content(sha256, content))
+    else:
+        rows.write(lambda transaction: transaction.remove_place(sha256, place))
 
 
 def bounded_records(reader: Reader, stream: str, from_sequence: int, count: int) -> Sequence[RecordRow]:

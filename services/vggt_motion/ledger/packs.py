@@ -9,6 +9,7 @@ next writer goes on behind it, and a check cuts it off where it is the end.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import re
@@ -47,8 +48,10 @@ class PackFiles:
         self._files = files or FileOperations()
         self._lock = threading.Lock()
         self._open: dict[int, _Pack] = {}
+        self._is_closed = False
         try:
             make_folder(folder, self._files)
+            self._files.sync_folder(folder.parent)  # a process that was killed may have made the folder only
             self._number = max(self.numbers(), default=1)
         except OSError as error:
             raise LedgerError(f"cannot use {folder} for packs: {error.strerror or error}") from error
@@ -69,7 +72,6 @@ class PackFiles:
             try:
                 pack.sync()
             except OSError:
-                # What a failed sync has left in the file is not known: nothing goes behind it.
                 with self._lock:
                     self._number = max(self._number, pack.number + 1)
                 raise
@@ -92,7 +94,18 @@ class PackFiles:
         except FileNotFoundError:
             return b""
         except OSError as error:
-            raise LedgerError(f"cannot read {self._path(place.pack)}: {error.strerror or error}") from error
+            if error.errno != errno.EIO:
+                raise LedgerError(f"cannot read {self._path(place.pack)}: {error.strerror or error}") from error
+            # As damaged as any: it can come back, and the others can still be read.
+            _LOGGER.error("cannot read %s at %d: %s", self._path(place.pack), place.offset_bytes, error.strerror)
+            return b""
+
+    def has(self, place: Place) -> bool:
+        """Whether the pack is as long as the place asks for."""
+        try:
+            return self._path(place.pack).stat().st_size >= place.offset_bytes + place.size_bytes
+        except OSError:
+            return False
 
     def numbers(self) -> list[int]:
         """The numbers of all packs, in order."""
@@ -112,8 +125,9 @@ class PackFiles:
         os.truncate(path, path.stat().st_size - byte_count)
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files for good: the session may be somebody else's from now on."""
         with self._lock:
+            self._is_closed = True
             for pack in self._open.values():
                 pack.close()
             self._open.clear()
@@ -126,6 +140,8 @@ class PackFiles:
         return pack
 
     def _pack(self, number: int, *, is_new: bool) -> _Pack:
+        if self._is_closed:
+            raise OSError(errno.EBADF, "the session is closed")
         if number not in self._open:
             self._open[number] = _Pack(self._path(number), number, self._files, may_create=is_new)
         return self._open[number]
@@ -162,11 +178,13 @@ class _Pack:
         self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if may_create else 0), 0o644)
         self.end = os.fstat(self._descriptor).st_size
         self._is_named = False  # also if it is there: a process that was killed may not have come to its name
+        self._failure: OSError | None = None
         self._shared_sync = SharedSync(self._force)
 
     def write(self, contents: Sequence[Content]) -> int:
         """Put contents behind what is there, not durable yet; returns where they begin. One caller at a time."""
         begin = self.end
+        self._refuse_after_failure()
         try:
             self._files.write_at(self._path, self._descriptor, begin, contents)
         except OSError:
@@ -187,7 +205,17 @@ class _Pack:
         os.close(self._descriptor)
 
     def _force(self) -> None:
-        self._files.sync_data(self._path, self._descriptor)
-        if not self._is_named:
-            self._files.sync_folder(self._path.parent)
-            self._is_named = True
+        self._refuse_after_failure()
+        try:
+            self._files.sync_data(self._path, self._descriptor)
+            if not self._is_named:
+                self._files.sync_folder(self._path.parent)
+                self._is_named = True
+        except OSError as error:
+            self._failure = error
+            raise
+
+    def _refuse_after_failure(self) -> None:
+        """After a sync that failed the next one may succeed though what was written before both is gone (fsync(2))."""
+        if self._failure is not None:
+            raise OSError(self._failure.errno, f"an earlier sync failed: {self._failure.strerror}")

@@ -162,6 +162,7 @@ class _Statements:
         )
 
     def set_place(self, entry: BlobEntry, place: Place) -> None:
+        self._run("DELETE FROM contents WHERE sha256 = ?", entry.sha256)
         self._run(
             """INSERT INTO blobs (sha256, size_bytes, pack, offset_bytes) VALUES (?, ?, ?, ?)
             ON CONFLICT (sha256)
@@ -186,9 +187,21 @@ class _Statements:
             entry.size_bytes,
         )
 
-    def remove_content(self, sha256: str) -> None:
-        self._run("DELETE FROM contents WHERE sha256 = ?", sha256)
-        self._run("UPDATE blobs SET is_file = 1, pack = 0, offset_bytes = 0 WHERE sha256 = ?", sha256)
+    def remove_content(self, sha256: str, content: bytes) -> None:
+        self._run("DELETE FROM contents WHERE sha256 = ? AND content = ?", sha256, content)
+        self._run(
+            """UPDATE blobs SET is_file = 1
+            WHERE sha256 = ? AND NOT EXISTS (SELECT 1 FROM contents WHERE contents.sha256 = blobs.sha256)""",
+            sha256,
+        )
+
+    def remove_place(self, sha256: str, place: Place) -> None:
+        self._run(
+            "UPDATE blobs SET pack = 0, offset_bytes = 0 WHERE sha256 = ? AND pack = ? AND offset_bytes = ?",
+            sha256,
+            place.pack,
+            place.offset_bytes,
+        )
 
     def set_meta(self, key: str, value: str) -> None:
         self._run(

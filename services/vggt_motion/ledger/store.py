@@ -225,8 +225,11 @@ class Transaction(Reader, Protocol):
     def set_content(self, entry: BlobEntry, content: Content) -> None:
         """Insert a blob with its content, or replace that."""
 
-    def remove_content(self, sha256: str) -> None:
-        """Forget the content of a blob among the rows, or its place in a pack."""
+    def remove_content(self, sha256: str, content: bytes) -> None:
+        """Forget the content of a blob among the rows, if it still is this one."""
+
+    def remove_place(self, sha256: str, place: Place) -> None:
+        """Forget where a blob lies, if that still is its place."""
 
     def set_meta(self, key: str, value: str) -> None:
         """Insert or replace a fact about the session."""
@@ -322,6 +325,9 @@ class Packs(Protocol):
 
     def read(self, place: Place) -> bytes:
         """What lies at a place; not verified."""
+
+    def has(self, place: Place) -> bool:
+        """Whether something of this length lies there."""
 
 
 def sha256_hex(data: Content) -> str:
