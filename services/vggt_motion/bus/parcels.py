@@ -158,12 +158,16 @@ class MemoryParcels(Parcels):
     def leave_answer(self, payload: bytes) -> Parcel | None:
         """See :meth:`Parcels.leave_answer`."""
         parcel = self.leave(payload)
-        if parcel is not None:
-            with self._lock:
+        if parcel is None:
+            return None
+        with self._lock:
+            if not self._is_closed:
                 self._answers.append(parcel)
                 if self._timer is None:
                     self._start_timer(_ANSWER_LIFE_S)
-        return parcel
+                return parcel
+        parcel.remove()
+        return None
 
     def is_near(self, attachment: bytes | None) -> bool:
         """See :meth:`Parcels.is_near`."""
