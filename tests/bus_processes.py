@@ -163,6 +163,21 @@ def wait_until_known(bus: Bus) -> None:
             raise
 
 
+def answer_when_ready(bus: Bus, call: str, payload: bytes) -> bytes:
+    """The answer of ``@rpc/test/{call}``, as soon as somebody gives one."""
+    answers: list[bytes] = []
+
+    def is_answered() -> bool:
+        try:
+            answers.append(bus.request(bus.keys.rpc("test", call), payload))
+        except BusUnavailableError:
+            return False
+        return True
+
+    wait_until(is_answered)
+    return answers[0]
+
+
 # --- roles -----------------------------------------------------------------------------------------------------------
 def answer(context: ServiceContext) -> None:
     """Answers on @rpc/test/*: what the bus promises to carry."""

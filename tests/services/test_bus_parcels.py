@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bus_processes import connect, running, wait_until
+from bus_processes import answer_when_ready, connect, running, wait_until
 from vggt_motion.bus import parcels
 from vggt_motion.bus.parcels import MemoryParcels
 from vggt_motion.bus.session import Bus
@@ -41,18 +41,7 @@ def left(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def ask(bus: Bus, content: bytes) -> bytes:
-    """As soon as somebody answers."""
-    answers: list[bytes] = []
-
-    def is_answered() -> bool:
-        try:
-            answers.append(bus.request(bus.keys.rpc("test", "reverse"), content))
-        except BusUnavailableError:
-            return False
-        return True
-
-    wait_until(is_answered)
-    return answers[0]
+    return answer_when_ready(bus, "reverse", content)
 
 
 def reverse(_: str, content: bytes) -> bytes:

@@ -12,6 +12,7 @@ import pytest
 import zenoh
 
 from bus_processes import (
+    answer_when_ready,
     bus_config,
     connect,
     free_port,
@@ -33,17 +34,7 @@ from vggt_motion.errors import (
 
 
 def echo_when_ready(bus: Bus, payload: bytes = b"") -> bytes:
-    answers: list[bytes] = []
-
-    def ask() -> bool:
-        try:
-            answers.append(bus.request(bus.keys.rpc("test", "echo"), payload))
-        except BusUnavailableError:
-            return False
-        return True
-
-    wait_until(ask)
-    return answers[0]
+    return answer_when_ready(bus, "echo", payload)
 
 
 def test_answers_and_refusals_come_back_as_what_they_are(bus: Bus, endpoint: str, tmp_path: Path) -> None:

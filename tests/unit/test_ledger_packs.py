@@ -107,22 +107,26 @@ def test_nothing_goes_behind_a_sync_that_failed(tmp_path: Path) -> None:
     packs.close()
 
 
-def test_who_wrote_behind_a_sync_that_failed_is_not_told_that_all_is_well(tmp_path: Path) -> None:
-    class FailsOnce(BrokenFiles):
-        def __init__(self) -> None:
-            self.release = threading.Event()
-            self.sync_count = 0
+class GatedFiles(FileOperations):
+    """Holds the first sync until it is released; may let it fail."""
 
-        def sync_data(self, path: Path, descriptor: int) -> None:
-            self.sync_count += 1
-            if self.sync_count == 1:
-                self.release.wait(10)
-                raise OSError(errno.EIO, "injected")
-            super().sync_data(path, descriptor)
+    def __init__(self, *, fails: bool) -> None:
+        self.release = threading.Event()
+        self.sync_count = 0
+        self.fails = fails
 
-    files = FailsOnce()
-    packs = PackFiles(tmp_path / "packs", files=files)
-    outcomes: dict[int, object] = {}
+    def sync_data(self, path: Path, descriptor: int) -> None:
+        self.sync_count += 1
+        is_first = self.sync_count == 1
+        self.release.wait(10)
+        if is_first and self.fails:
+            raise OSError(errno.EIO, "injected")
+        super().sync_data(path, descriptor)
+
+
+def append_behind_the_first_sync(packs: PackFiles, files: GatedFiles, count: int) -> list[list[Place] | LedgerError]:
+    """Append 0, 1, ... from as many threads, all but the first while the first one syncs; what became of each."""
+    outcomes: dict[int, list[Place] | LedgerError] = {}
 
     def append(number: int) -> None:
         try:
@@ -130,18 +134,25 @@ def test_who_wrote_behind_a_sync_that_failed_is_not_told_that_all_is_well(tmp_pa
         except LedgerError as error:
             outcomes[number] = error
 
-    threads = [threading.Thread(target=append, args=(number,)) for number in range(4)]
+    threads = [threading.Thread(target=append, args=(number,)) for number in range(count)]
     threads[0].start()
     while files.sync_count == 0:
         time.sleep(0.001)
     for thread in threads[1:]:
         thread.start()
-    while packs._open[1]._shared_sync._asked < 4:
+    while packs._open[1]._shared_sync._asked < count:
         time.sleep(0.001)
     files.release.set()
     for thread in threads:
         thread.join()
-    assert [type(outcomes[number]) for number in range(4)] == [LedgerError] * 4
+    return [outcomes[number] for number in range(count)]
+
+
+def test_who_wrote_behind_a_sync_that_failed_is_not_told_that_all_is_well(tmp_path: Path) -> None:
+    files = GatedFiles(fails=True)
+    packs = PackFiles(tmp_path / "packs", files=files)
+    outcomes = append_behind_the_first_sync(packs, files, 4)
+    assert [type(outcome) for outcome in outcomes] == [LedgerError] * 4
     assert packs.append([b"later"]) == [Place(2, 0, 5)]
     packs.close()
 
@@ -205,36 +216,12 @@ def test_after_the_end_nothing_is_written_into_what_may_be_somebody_elses(tmp_pa
 
 
 def test_callers_at_the_same_time_share_a_sync(tmp_path: Path) -> None:
-    class Gated(FileOperations):
-        def __init__(self) -> None:
-            self.release = threading.Event()
-            self.sync_count = 0
-
-        def sync_data(self, path: Path, descriptor: int) -> None:
-            self.sync_count += 1
-            self.release.wait(10)
-            super().sync_data(path, descriptor)
-
-    files = Gated()
+    files = GatedFiles(fails=False)
     packs = PackFiles(tmp_path / "packs", files=files)
-    places: dict[int, Place] = {}
-
-    def append(number: int) -> None:
-        (places[number],) = packs.append([b"%d" % number])
-
-    threads = [threading.Thread(target=append, args=(number,)) for number in range(8)]
-    threads[0].start()
-    while files.sync_count == 0:
-        time.sleep(0.001)
-    for thread in threads[1:]:
-        thread.start()
-    while packs._open[1]._shared_sync._asked < 8:
-        time.sleep(0.001)
-    files.release.set()
-    for thread in threads:
-        thread.join()
+    outcomes = append_behind_the_first_sync(packs, files, 8)
     assert files.sync_count == 2, "the second one stands for the seven that came during the first"
-    assert all(packs.read(place) == b"%d" % number for number, place in places.items())
+    places = [place for outcome in outcomes if isinstance(outcome, list) for place in outcome]
+    assert [packs.read(place) for place in places] == [b"%d" % number for number in range(8)]
     packs.close()
 
 

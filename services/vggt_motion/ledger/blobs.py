@@ -1,4 +1,4 @@
-"""Large blobs as files named by their content: ``blobs/abcdef...``. Small ones stand in packs (:mod:`.packs`).
+"""Large blobs as files named by their content: ``blobs/abcdef...``. For the small ones see :mod:`.packs`.
 
 A blob is written under ``blobs/incoming``, forced to the disk, renamed to its name and its folder forced to the disk;
 only then does a row refer to it. So a name under ``blobs`` always stands for whole content, whatever was killed;
