@@ -9,6 +9,7 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
+from vggt_motion.direct import aligned_up
 from vggt_motion.ledger.directory import Ledger
 from vggt_motion.ledger.jobs import JobPolicy
 from vggt_motion.ledger.sqlite import read_only
@@ -16,6 +17,11 @@ from vggt_motion.ledger.store import NewRecord
 from vggt_motion.records import Job, JobKind, JobReport
 
 RESULT_STREAMS = {"describe": "descriptor", "predict": "submap", "register": "constraint"}
+
+
+def in_pack(*batches: bytes) -> bytes:
+    """What a pack holds after these were written, one after the other: each from the beginning of a block."""
+    return b"".join(content.ljust(aligned_up(len(content)), b"\0") for content in batches)
 
 
 def damage_blob(directory: Path, sha256: str, content: bytes) -> None:

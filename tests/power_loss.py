@@ -165,11 +165,11 @@ class DiskLog:
                 if name is not None:
                     log.add(Operation("sync", name, begun))
 
-            def write_at(self, path: Path, descriptor: int, offset_bytes: int, pieces: Sequence[bytes]) -> None:
+            def write_blocks(self, path: Path, descriptor: int, offset_bytes: int, blocks: memoryview) -> None:
                 name = log.relative(str(path))
                 if name is not None:
-                    log.add(Operation("write", name, offset_bytes, b"".join(pieces)))
-                super().write_at(path, descriptor, offset_bytes, pieces)
+                    log.add(Operation("write", name, offset_bytes, bytes(blocks)))
+                super().write_blocks(path, descriptor, offset_bytes, blocks)
 
             def sync_data(self, path: Path, descriptor: int) -> None:
                 name = log.relative(str(path))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from vggt_motion.direct import write_blocks
+
 NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the errors by which a file system says that it is full."""
-
-_MAX_PIECES = 512  # in one call; the least that systems allow is 16, Linux allows 1024
 
 
 class FileOperations:
@@ -29,16 +29,9 @@ class FileOperations:
         finally:
             os.close(descriptor)
 
-    def write_at(self, path: Path, descriptor: int, offset_bytes: int, pieces: Sequence[bytes | memoryview]) -> None:
-        """Write pieces one behind the other into the open file ``path``; not durable yet."""
-        views = [memoryview(piece) for piece in pieces if piece]
-        while views:
-            written = os.pwritev(descriptor, views[:_MAX_PIECES], offset_bytes)
-            offset_bytes += written
-            while views and written >= len(views[0]):
-                written -= len(views.pop(0))
-            if written:
-                views[0] = views[0][written:]
+    def write_blocks(self, path: Path, descriptor: int, offset_bytes: int, blocks: memoryview) -> None:
+        """Write whole blocks into the open file ``path`` past the cache (:mod:`..direct`); not durable yet."""
+        write_blocks(descriptor, blocks, offset_bytes)
 
     def sync_data(self, path: Path, descriptor: int) -> None:
         """Force the content and the length of the open file ``path`` to the disk."""

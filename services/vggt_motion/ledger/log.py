@@ -90,6 +90,10 @@ class Prepared:
 _NOTHING = Prepared()
 
 
+class _NotNewError(Exception):
+    """The record or one of its blobs has been here before."""
+
+
 class _Needs(NamedTuple):
     """What has to become durable before the row of a record."""
 
@@ -171,6 +175,44 @@ class Store:
         Returns:
             For each, in order, its acknowledgement or what :meth:`append` would have raised.
         """
+        outcomes = self._appended_as_new(wanted)
+        if len(outcomes) < len(wanted):
+            rest = [index for index in range(len(wanted)) if index not in outcomes]
+            outcomes |= zip(rest, self._append_after_a_look([wanted[index] for index in rest]), strict=True)
+        return [outcomes[index] for index in range(len(wanted))]
+
+    def _appended_as_new(self, wanted: Sequence[Append]) -> dict[int, Appended | Exception]:
+        """Append those that need nothing but their rows if they are new: most do and are, and nothing is read twice."""
+        free_bytes = self._blobs.free_bytes()
+        size_bytes = sum(len(blob.data) if isinstance(blob, Blob) else len(blob) for e in wanted for blob in e.blobs)
+        if size_bytes > self._inline_bytes or free_bytes < self.reserve_bytes + 2 * size_bytes:
+            return {}
+        changes: dict[int, Callable[[Transaction], Appended]] = {}
+        for index, entry in enumerate(wanted):
+            blobs = {blob.entry: blob.data for blob in map(Blob.of, entry.blobs)}
+            if len(blobs) <= MAX_BLOBS_PER_RECORD and set(entry.references) == set(blobs) and _is_valid(entry.record):
+                changes[index] = functools.partial(self._add_if_new, entry.record, blobs)
+        written = self._write_all(changes)
+        return {index: outcome for index, outcome in written.items() if not isinstance(outcome, _NotNewError)}
+
+    def _add_if_new(self, record: NewRecord, blobs: dict[BlobEntry, Content], transaction: Transaction) -> Appended:
+        if self._find_known(transaction, record) is not None:
+            raise _NotNewError
+        for entry in blobs:
+            if transaction.find_blob(entry.sha256) is not None:
+                raise _NotNewError
+        return self._insert(transaction, record, Prepared(tuple(blobs), contents=tuple(blobs.items())))
+
+    def _write_all(self, changes: dict[int, Callable[[Transaction], Appended]]) -> dict[int, Appended | Exception]:
+        if not changes:
+            return {}
+        try:
+            return dict(zip(changes, self._rows.write_all(list(changes.values())), strict=True))
+        except VggtMotionError as error:
+            return dict.fromkeys(changes, error)
+
+    def _append_after_a_look(self, wanted: Sequence[Append]) -> list[Appended | Exception]:
+        """:meth:`append_all` of those that may be known, or bring more than stands among the rows."""
         outcomes: dict[int, Appended | Exception] = {}
         needed: dict[int, _Needs] = {}
         known = self._known(wanted)
@@ -192,13 +234,7 @@ class Store:
                 outcomes[index] = prepared
             else:
                 changes[index] = functools.partial(self.add, record=wanted[index].record, prepared=prepared)
-        written: Sequence[Appended | Exception] = ()
-        try:
-            if changes:
-                written = self._rows.write_all(list(changes.values()))
-        except VggtMotionError as error:
-            written = [error] * len(changes)
-        outcomes |= zip(changes, written, strict=True)
+        outcomes |= self._write_all(changes)
         return [outcomes[index] for index in range(len(wanted))]
 
     def _known(self, wanted: Sequence[Append]) -> dict[int, RecordRow | VggtMotionError]:
@@ -329,13 +365,14 @@ class Store:
     def add(self, transaction: Transaction, record: NewRecord, prepared: Prepared = _NOTHING) -> Appended:
         """Append within a larger change; the record must be checked and its blobs prepared already."""
         known = self._find_known(transaction, record)
-        # Also of a known record: a content that was damaged comes back so.
-        for entry, place in prepared.places:
-            transaction.set_place(entry, place)
-        for entry, content in prepared.contents:
-            transaction.set_content(entry, content)
-        if known is not None:
-            return Appended(known.sequence, was_known=True)
+        if known is None:
+            return self._insert(transaction, record, prepared)
+        # A content that was damaged comes back so.
+        _tell_where(transaction, prepared)
+        return Appended(known.sequence, was_known=True)
+
+    def _insert(self, transaction: Transaction, record: NewRecord, prepared: Prepared) -> Appended:
+        _tell_where(transaction, prepared)
         sequence = transaction.next_sequence(record.stream)
         time_ns = self._time_ns()
         row = RecordRow(
@@ -427,6 +464,13 @@ class Store:
         return is_row or self._blobs.has(entry.sha256, entry.size_bytes)
 
 
+def _tell_where(transaction: Transaction, prepared: Prepared) -> None:
+    for entry, place in prepared.places:
+        transaction.set_place(entry, place)
+    for entry, content in prepared.contents:
+        transaction.set_content(entry, content)
+
+
 def set_content_aside(rows: Rows, blobs: Blobs, sha256: str, content: bytes, place: Place | None) -> None:
     """Forget a small blob that is damaged where it was read, and keep what there is for a person.
 
@@ -483,6 +527,14 @@ def check_record(record: NewRecord) -> None:
         )
     if len(record.payload) > MAX_PAYLOAD_BYTES:
         raise InvalidRequestError(f"a payload of {len(record.payload)} bytes; at most {MAX_PAYLOAD_BYTES} are allowed")
+
+
+def _is_valid(record: NewRecord) -> bool:
+    try:
+        check_record(record)
+    except InvalidRequestError:
+        return False
+    return True
 
 
 def row_digest(record: NewRecord, sequence: int, append_time_ns: int) -> bytes:

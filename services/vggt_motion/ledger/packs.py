@@ -1,9 +1,9 @@
 """Small blobs one behind the other in files of their own: ``blobs/packs/00000001.pack``.
 
 A file for each would cost two syncs and a name; among the rows each is written twice, to the write-ahead log and to the
-database. Here many share one sync. A pack holds contents and nothing else: which blob lies where stands in the rows,
-and they refer to a place only after what lies there has been forced to the disk. So nobody refers to what was torn; the
-next writer goes on behind it, and a check cuts it off where it is the end.
+database. Here many share one sync. A pack holds contents and nothing else, each batch from the beginning of a block:
+which blob lies where stands in the rows, and they refer to a place only after what lies there has been forced to the
+disk. So nobody refers to what was torn; the next writer goes on behind it, and a check cuts it off where it is the end.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+from vggt_motion.direct import aligned_up, block_memory, open_direct, read_direct
 from vggt_motion.errors import DiskFullError, LedgerError
 from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, make_folder
 from vggt_motion.ledger.store import Content, Place
@@ -25,6 +26,7 @@ from vggt_motion.ledger.store import Content, Place
 _LOGGER = logging.getLogger(__name__)
 _NAME = re.compile(r"(\d{8})\.pack")
 MAX_PACK_BYTES: Final = 2**30
+_STAGE_BYTES = 8 * 2**20
 
 
 class PackFiles:
@@ -112,11 +114,15 @@ class PackFiles:
         return sorted(int(match[1]) for path in self._folder.iterdir() if (match := _NAME.fullmatch(path.name)))
 
     def unused_bytes(self, used: Iterable[Place]) -> dict[int, int]:
-        """Per pack, how many bytes lie behind the last place that is used."""
+        """Per pack, how many bytes lie behind the block in which the last place that is used ends."""
         ends = dict.fromkeys(self.numbers(), 0)
         for place in used:
             ends[place.pack] = max(ends.get(place.pack, 0), place.offset_bytes + place.size_bytes)
-        rests = {number: self._path(number).stat().st_size - end for number, end in ends.items() if self._has(number)}
+        rests = {
+            number: self._path(number).stat().st_size - aligned_up(end)
+            for number, end in ends.items()
+            if self._has(number)
+        }
         return {number: rest for number, rest in rests.items() if rest > 0}
 
     def cut_off(self, number: int, byte_count: int) -> None:
@@ -159,9 +165,11 @@ def read_place(folder: Path, place: Place) -> bytes:
     Raises:
         OSError: it cannot be read.
     """
-    with _path(folder, place.pack).open("rb") as file:
-        file.seek(place.offset_bytes)
-        return file.read(place.size_bytes)
+    descriptor = open_direct(_path(folder, place.pack), os.O_RDONLY)
+    try:
+        return read_direct(descriptor, place.offset_bytes, place.size_bytes)
+    finally:
+        os.close(descriptor)
 
 
 def _path(folder: Path, number: int) -> Path:
@@ -175,8 +183,8 @@ class _Pack:
         self.number = number
         self._path = path
         self._files = files
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if may_create else 0), 0o644)
-        self.end = os.fstat(self._descriptor).st_size
+        self._descriptor = open_direct(path, os.O_RDWR | (os.O_CREAT if may_create else 0))
+        self.end = aligned_up(os.fstat(self._descriptor).st_size)
         self._is_named = False  # also if it is there: a process that was killed may not have come to its name
         self._failure: OSError | None = None
         self._shared_sync = SharedSync(self._force)
@@ -186,12 +194,12 @@ class _Pack:
         begin = self.end
         self._refuse_after_failure()
         try:
-            self._files.write_at(self._path, self._descriptor, begin, contents)
+            self._write(contents)
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, begin)
+            self.end = begin
             raise
-        self.end = begin + sum(map(len, contents))
         return begin
 
     def sync(self) -> None:
@@ -199,10 +207,32 @@ class _Pack:
         self._shared_sync()
 
     def read(self, place: Place) -> bytes:
-        return os.pread(self._descriptor, place.size_bytes, place.offset_bytes)
+        return read_direct(self._descriptor, place.offset_bytes, place.size_bytes)
 
     def close(self) -> None:
         os.close(self._descriptor)
+
+    def _write(self, contents: Sequence[Content]) -> None:
+        size_bytes = sum(map(len, contents))
+        with block_memory(min(size_bytes, _STAGE_BYTES)) as stage:
+            filled = 0
+            for content in contents:
+                rest = memoryview(content)
+                while rest:
+                    count = min(len(rest), len(stage) - filled)
+                    stage[filled : filled + count] = rest[:count]
+                    filled, rest = filled + count, rest[count:]
+                    if filled == len(stage):
+                        self._write_blocks(stage)
+                        filled = 0
+            if filled:
+                padded = aligned_up(filled)
+                stage[filled:padded] = bytes(padded - filled)
+                self._write_blocks(stage[:padded])
+
+    def _write_blocks(self, blocks: memoryview) -> None:
+        self._files.write_blocks(self._path, self._descriptor, self.end, blocks)
+        self.end += len(blocks)
 
     def _force(self) -> None:
         self._refuse_after_failure()
