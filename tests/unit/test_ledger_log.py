@@ -417,16 +417,17 @@ class Gate:
 
     def __init__(self, rows: SqliteRows, waiting: int) -> None:
         self.commit_sizes: list[int] = []
-        commit = rows._commit
+        commits = rows._commits
+        commit = commits._carry_out
 
-        def gated(batch: Any) -> None:
+        def gated(batch: Any) -> Any:
             if not self.commit_sizes:
-                while len(rows._pending) < waiting:
+                while len(commits._waiting) < waiting:
                     time.sleep(0.001)
             self.commit_sizes.append(len(batch))
-            commit(batch)
+            return commit(batch)
 
-        rows._commit = gated  # type: ignore[method-assign]
+        commits._carry_out = gated
 
 
 def test_concurrent_appends_share_one_commit(ledger: Ledger) -> None:

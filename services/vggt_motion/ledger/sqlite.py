@@ -11,12 +11,12 @@ import dataclasses
 import operator
 import queue
 import sqlite3
-import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from vggt_motion.errors import DiskFullError, LedgerError, VggtMotionError
+from vggt_motion.gathering import Gathering
 from vggt_motion.ledger.schema import MIGRATIONS, SCHEMA_VERSION
 from vggt_motion.ledger.store import BlobEntry, Content, JobRow, LeaseRow, Place, Reader, RecordRow, Transaction
 from vggt_motion.records import JobState
@@ -268,15 +268,7 @@ def _offered(kinds: Collection[str], models: Collection[str]) -> tuple[str, list
     return where, [JobState.OPEN.value, *sorted(kinds), *offered_models]
 
 
-class _Pending(Generic[T]):
-    """The changes of one caller on their way through the group commit."""
-
-    def __init__(self, changes: Sequence[Callable[[Transaction], T]]) -> None:
-        self.changes = changes
-        self.outcomes: list[T | Exception] = []
-        self.error: BaseException | None = None  # of the commit as a whole
-        self.is_finished = False
-        self.gate: threading.Lock | None = None  # where the caller waits, until it is finished or its turn to commit
+_Changes: TypeAlias = Sequence[Callable[[Transaction], Any]]
 
 
 class SqliteRows:
@@ -289,10 +281,7 @@ class SqliteRows:
             LedgerError: not a database of ours, of a newer schema, damaged, or not writable.
         """
         self._path = path
-        self._lock = threading.Lock()
-        self._is_idle = threading.Condition(self._lock)
-        self._pending: list[_Pending[Any]] = []
-        self._is_committing = False
+        self._commits: Gathering[_Changes, list[Any]] = Gathering(self._commit)
         self._failure: str | None = None
         self._readers: queue.LifoQueue[sqlite3.Connection | None] = queue.LifoQueue()
         for _ in range(_MAX_READERS):
@@ -317,38 +306,7 @@ class SqliteRows:
 
     def write_all(self, changes: Sequence[Callable[[Transaction], T]]) -> list[T | Exception]:
         """Carry out several changes, each atomically, under one fsync; see :meth:`.store.Rows.write_all`."""
-        item: _Pending[T] = _Pending(changes)
-        with self._lock:
-            self._pending.append(item)
-            if self._is_committing:
-                item.gate = threading.Lock()
-                item.gate.acquire()
-            self._is_committing = True
-        if item.gate is not None:
-            item.gate.acquire()
-        if not item.is_finished:
-            self._commit_pending()
-        if item.error is not None:
-            raise item.error
-        return item.outcomes
-
-    def _commit_pending(self) -> None:
-        """Commit what has gathered, and pass the turn to the first that came meanwhile."""
-        with self._lock:
-            batch, self._pending = self._pending, []
-        try:
-            self._commit(batch)
-        finally:
-            with self._lock:
-                self._is_committing = bool(self._pending)
-                following = self._pending[:1]
-                if not following:
-                    self._is_idle.notify_all()
-            for member in batch:
-                member.is_finished = True
-            for member in (*following, *batch):
-                if member.gate is not None:
-                    member.gate.release()
+        return self._commits(changes)
 
     def read(self, query: Callable[[Reader], T]) -> T:
         """Ask for committed rows; see :meth:`.store.Rows.read`."""
@@ -375,10 +333,10 @@ class SqliteRows:
 
     def close(self) -> None:
         """Finish the present commit, fold the write-ahead log into the database and close it."""
-        with self._is_idle:
-            self._is_idle.wait_for(lambda: not self._is_committing)
-            if self._failure is None:
-                self._failure = f"{self._path} is closed"
+        self._commits.wait_until_idle()
+        if self._failure is None:
+            self._failure = f"{self._path} is closed"
+        self._commits.wait_until_idle()  # one that came between
         for _ in range(_MAX_READERS):
             connection = self._readers.get()
             if connection is not None:
@@ -387,18 +345,17 @@ class SqliteRows:
             self._readers.put(None)
         self._writer.close()
 
-    def _commit(self, batch: Sequence[_Pending[Any]]) -> None:
+    def _commit(self, batch: Sequence[_Changes]) -> Sequence[list[Any]]:
         try:
             if self._failure is not None:
                 raise LedgerError(self._failure)
             with _errors_of(self._path):
                 self._writer.execute("BEGIN IMMEDIATE")
-                if sum(len(item.changes) for item in batch) == 1:
-                    self._run_alone(batch[0])
-                else:
-                    for item in batch:
-                        self._run_among_others(item)
-                    self._writer.execute("COMMIT")
+                if len(batch) == 1 and len(batch[0]) == 1:
+                    return [[self._run_alone(batch[0][0])]]
+                outcomes = [[self._run_among_others(change) for change in changes] for changes in batch]
+                self._writer.execute("COMMIT")
+                return outcomes
         except BaseException as error:
             if self._failure is None and _is_storage_failure(error.__cause__):
                 # After a failed write the state of the file is not known until it is opened and recovered again.
@@ -406,23 +363,22 @@ class SqliteRows:
             with contextlib.suppress(sqlite3.Error):
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
-            for item in batch:
-                item.error = error
+            raise
 
-    def _run_alone(self, item: _Pending[Any]) -> None:
+    def _run_alone(self, change: Callable[[Transaction], T]) -> T | Exception:
         """One change is the whole transaction."""
-        (outcome,) = item.outcomes = [self._outcome(item.changes[0])]
+        outcome = self._outcome(change)
         self._writer.execute("ROLLBACK" if isinstance(outcome, Exception) else "COMMIT")
+        return outcome
 
-    def _run_among_others(self, item: _Pending[Any]) -> None:
+    def _run_among_others(self, change: Callable[[Transaction], T]) -> T | Exception:
         """Each change may be undone without the others."""
-        for change in item.changes:
-            self._writer.execute("SAVEPOINT change")
-            outcome = self._outcome(change)
-            if isinstance(outcome, Exception):
-                self._writer.execute("ROLLBACK TO change")
-            self._writer.execute("RELEASE change")
-            item.outcomes.append(outcome)
+        self._writer.execute("SAVEPOINT change")
+        outcome = self._outcome(change)
+        if isinstance(outcome, Exception):
+            self._writer.execute("ROLLBACK TO change")
+        self._writer.execute("RELEASE change")
+        return outcome
 
     def _outcome(self, change: Callable[[Transaction], T]) -> T | Exception:
         try:
