@@ -56,6 +56,7 @@ class LedgerConfig(Section):
     max_failures: int = Field(3, ge=1, description="failures that workers report until a job is dead")
     max_lost_leases: int = Field(10, ge=1, description="lost leases until a job is dead")
     retry_backoff_s: float = Field(0.5, ge=0, description="a failed job waits this long, doubled each time")
+    recent_bytes: int = Field(32 * 2**20, ge=0, description="so much of the last payloads is answered from memory")
 
 
 # What VGGT-Long calls chunk 60 / overlap 30 is a base of 30 keyframes here, together with an overlap of 30.
@@ -304,7 +305,7 @@ class RecorderConfig(Section):
     flush_interval_s: float = Field(
         1.0, gt=0, description="at most this much of the recording is lost with the process"
     )
-    chunk_bytes: int = Field(4 * 2**20, ge=1024)
+    chunk_bytes: int = Field(2**20, ge=1024)
 
 
 class RunConfig(Section):

@@ -10,7 +10,7 @@ import pytest
 
 from bus_processes import Process, connect, entry, free_port, running, serve, wait_until, wait_until_heard
 from vggt_motion.bus import calls, codec
-from vggt_motion.bus.follow import Followed, Follower
+from vggt_motion.bus.follow import SEVERAL_ENTRIES, Followed, Follower
 from vggt_motion.bus.log import LogFollower
 from vggt_motion.bus.session import Bus
 from vggt_motion.errors import LedgerError
@@ -189,5 +189,10 @@ def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: 
         publisher.put(codec.encode(entries[4]))
         wait_until(lambda: has(1, 2, 3, 4))
         assert log.positions()[Stream.EVENT] == 5
+        together = tuple(entry(number) for number in range(3, 8))  # two of them are known already
+        entries.extend(together[2:])
+        publisher.put(codec.encode(calls.ReadReply(together, 8)), encoding=SEVERAL_ENTRIES)
+        publisher.put(b"garbage", encoding=SEVERAL_ENTRIES)
+        wait_until(lambda: has(*range(1, 8)))
         assert any(answer is not None and answer.position("event") == 4 for answer in statuses)
         log.close()

@@ -33,7 +33,7 @@ def left(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     def leave(self: MemoryParcels, content: bytes) -> parcels.Parcel | None:
         parcel = real(self, content)
         if parcel is not None:
-            lengths.append(parcel.size_bytes)
+            lengths.append(len(content))
         return parcel
 
     monkeypatch.setattr(MemoryParcels, "leave", leave)
@@ -67,7 +67,7 @@ def test_after_the_first_one_long_payloads_go_by_parcels_both_ways(endpoint: str
         assert left == [200_000] * 9
         assert ask(client, b"short") == b"trohs"
         assert len(left) == 9
-        assert files_in(folder_of(client)) == []
+        assert len(files_in(folder_of(client))) == 1, "the client's, to be filled again"
         folder = folder_of(client)
     assert not folder.exists()
 
@@ -90,8 +90,8 @@ def test_many_at_once_are_not_mixed_up_whether_or_not_there_is_memory(
         with ThreadPoolExecutor(16) as pool:
             answers = list(pool.map(lambda number: client.request(key, payload(number)), range(200)))
         assert answers == [payload(number)[::-1] for number in range(200)]
-        assert 50 < len(left) < 300
-        assert files_in(folder_of(client)) == []
+        assert 50 < len(left) < 350
+        assert len(files_in(folder_of(client))) <= 16
 
 
 @pytest.mark.parametrize("side", ["client", "server"])

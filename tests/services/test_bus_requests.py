@@ -22,6 +22,8 @@ from bus_processes import (
     wait_until_heard,
     wait_until_served,
 )
+from vggt_motion.bus import calls, codec
+from vggt_motion.bus.serving import BUNDLE_ENCODING
 from vggt_motion.bus.session import Bus, EndpointTakenError, open_bus, zenoh_config
 from vggt_motion.errors import (
     BusError,
@@ -189,6 +191,92 @@ def test_a_batch_ends_before_it_grows_too_large_and_a_defect_refuses_all_of_it(e
                 with pytest.raises(RequestRefusedError, match="internal error: ValueError"):
                     future.result(30)
     assert sum(batches) == 72 * 2**20 and max(batches) <= 32 * 2**20
+
+
+def test_what_one_client_asks_at_a_time_travels_together_and_each_gets_its_own(endpoint: str) -> None:
+    release = threading.Event()
+    batches: list[list[bytes]] = []
+    answered: list[int] = []
+
+    def handler(payloads: Sequence[bytes | memoryview]) -> list[bytes | Exception]:
+        batches.append([bytes(payload) for payload in payloads])
+        if batches == [[b"first"]]:
+            assert release.wait(30)
+        return [RequestRefusedError("odd", RefusalCode.CONFLICT) if p == b"odd" else bytes(p) for p in payloads]
+
+    def taken_in() -> int:
+        return len(client._gatherings[key]._waiting)
+
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "together")
+        server.serve_together(key, handler, at_a_time=8, after=lambda: answered.append(len(batches)))
+        wait_until_served(client, key)
+        long = bytes(3_000_000)
+        with ThreadPoolExecutor(128) as pool:
+            asked = [pool.submit(client.request_among_others, key, b"first")]
+            wait_until(lambda: bool(batches))
+            asked += [pool.submit(client.request_among_others, key, b"second")]  # the other lane
+            wait_until(lambda: client._gatherings[key]._busy_lanes == 2)
+            kinds = [b"odd", b"even", b"x" * 100_000]
+            asked += [pool.submit(client.request_among_others, key, kinds[number % 3]) for number in range(90)]
+            wait_until(lambda: taken_in() == 90)
+            alone = pool.submit(client.request_among_others, key, long)
+            release.set()
+            assert alone.result(30) == long
+            for number, future in enumerate(asked[2:]):
+                if number % 3 == 0:
+                    with pytest.raises(RequestRefusedError, match="odd") as refused:
+                        future.result(30)
+                    assert refused.value.code is RefusalCode.CONFLICT
+                else:
+                    assert future.result(30) == kinds[number % 3]
+            assert [future.result(30) for future in asked[:2]] == [b"first", b"second"]
+    sizes = [len(batch) for batch in batches]
+    assert sum(sizes) == 93 and max(sizes) >= 64, "one message may hold 64"
+    assert len(answered) == len(batches)
+
+
+def test_a_bundle_that_is_none_is_one_request_and_a_defect_refuses_all_of_a_bundle(endpoint: str) -> None:
+    came: list[list[bytes]] = []
+
+    def handler(payloads: Sequence[bytes | memoryview]) -> list[bytes | Exception]:
+        came.append([bytes(payload) for payload in payloads])
+        raise ValueError("a defect")
+
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "together")
+        server.serve_together(key, handler, at_a_time=8)
+        wait_until_served(client, key)
+        broken = [b"", b"\xff" * 20, codec.encode(calls.Bundle((b"a",)))[:-1]]
+        for payload in broken:
+            with pytest.raises(RequestRefusedError, match="ValueError"):
+                client.request(key, payload, encoding=BUNDLE_ENCODING)
+        assert came == [[payload] for payload in broken]
+        bundle = codec.encode(calls.Bundle((b"a", b"b")))
+        reply = codec.decode(calls.BundleReply, client.request(key, bundle, encoding=BUNDLE_ENCODING))
+        assert [answer.refusal and answer.refusal.code for answer in reply.answers] == [RefusalCode.INTERNAL] * 2
+        assert came[-1] == [b"a", b"b"]
+
+
+def test_an_interrupted_process_does_not_wait_for_what_gathers(endpoint: str) -> None:
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "together")
+        release = threading.Event()
+
+        def handler(payloads: Sequence[bytes | memoryview]) -> list[bytes | Exception]:
+            release.wait(30)
+            return [b""] * len(payloads)
+
+        server.serve_together(key, handler, at_a_time=8)
+        wait_until_served(client, key)
+        with ThreadPoolExecutor(16) as pool:
+            asked = [pool.submit(client.request_among_others, key, b"x") for _ in range(16)]
+            wait_until(lambda: len(client._gatherings) == 1 and len(client._gatherings[key]._waiting) == 14)
+            client.interrupt()
+            for future in asked:
+                with pytest.raises(BusUnavailableError):
+                    future.result(10)
+        release.set()
 
 
 def test_a_wildcard_request_is_refused(endpoint: str) -> None:

@@ -7,6 +7,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ from ledger_processes import (
     submap,
 )
 from vggt_motion.bus import calls, codec
-from vggt_motion.bus.follow import Follower
-from vggt_motion.bus.ledger import append_request
+from vggt_motion.bus.follow import SEVERAL_ENTRIES, Follower
+from vggt_motion.bus.ledger import AppendResult, append_request
 from vggt_motion.bus.liveliness import ServiceWatch
 from vggt_motion.errors import (
     BusUnavailableError,
@@ -34,7 +35,7 @@ from vggt_motion.errors import (
     RequestRefusedError,
 )
 from vggt_motion.ledger.check import check
-from vggt_motion.records import BlobRef, Event, EventKind, JobKind, JobState
+from vggt_motion.records import BlobRef, Event, EventKind, JobKind, JobState, Keyframe
 
 PREDICT = (JobKind.PREDICT,)
 
@@ -69,6 +70,37 @@ def test_records_and_blobs_come_back_as_they_were_stored(running: Site) -> None:
     status = client.status()
     assert status.position("keyframe") == 3 and status.position("segment") == 0
     assert status.is_accepting and status.detail == "" and status.stored_bytes > 3000
+
+
+def test_what_is_appended_at_a_time_keeps_its_order_and_is_published_together(running: Site) -> None:
+    encodings: list[str] = []
+    key = running.bus.keys.log("keyframe")
+    running.bus.subscribe(key, lambda sample: encodings.append(sample.encoding), is_small=True)
+    client = running.client()
+    images = [bytes([number]) * 40_000 for number in range(20)]
+    frames = [keyframe(number, image) for number, image in enumerate(images)]
+    first = frames[7]
+    assert client.append("keyframe", first.keyframe_id, first, [images[7]]).sequence == 0
+    conflicting = replace(frames[3], capture_time_ns=frames[3].capture_time_ns + 1)
+    requests = [
+        codec.encode_in_pieces(append_request("keyframe", frame.keyframe_id, frame, [image]))
+        for frame, image in zip((*frames, conflicting), (*images, images[3]), strict=True)
+    ]
+    results = client.append_all_encoded(requests)
+    others = [number for number in range(20) if number != 7]
+    assert [(r.sequence, r.was_known) for r in results if isinstance(r, AppendResult)] == [
+        (0, True) if number == 7 else (1 + others.index(number), False) for number in range(20)
+    ]
+    assert isinstance(results[20], RequestRefusedError) and results[20].code is RefusalCode.CONFLICT
+    assert [entry.record_id for entry in client.read("keyframe", 0)] == [
+        first.keyframe_id, *(frames[number].keyframe_id for number in others)
+    ]  # fmt: skip
+    for frame, image in zip(frames, images, strict=True):
+        assert client.blob(frame.image) == image
+    wait_until(lambda: SEVERAL_ENTRIES in encodings)
+    follower = Follower(running.bus, "keyframe", Keyframe)
+    assert [followed.sequence for _ in range(20) if (followed := follower.next(10.0))] == list(range(20))
+    follower.close()
 
 
 def test_another_content_under_a_known_id_is_a_conflict(running: Site) -> None:

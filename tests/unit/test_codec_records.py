@@ -255,6 +255,18 @@ STRATEGIES: dict[type, st.SearchStrategy[Any]] = {
         st.from_regex("[0-9a-z-]{0,64}", fullmatch=True),
         st.integers(0, 2**29),
     ),
+    calls.Bundle: st.builds(calls.Bundle, st.lists(st.binary(max_size=50), min_size=1, max_size=3).map(tuple)),
+    calls.BundleReply: st.builds(
+        calls.BundleReply,
+        st.lists(
+            st.builds(
+                calls.BundledAnswer,
+                st.binary(max_size=50),
+                st.none() | st.builds(calls.Refusal, st.sampled_from(RefusalCode), lines),
+            ),
+            max_size=3,
+        ).map(tuple),
+    ),
     calls.AppendRequest: appends,
     calls.AppendReply: st.builds(calls.AppendReply, indices, st.booleans()),
     calls.ReadRequest: st.builds(calls.ReadRequest, names, indices, counts),

@@ -60,7 +60,7 @@ def test_what_comes_while_all_lanes_are_busy_goes_together_in_order(lanes: int) 
 
 def test_a_batch_is_no_heavier_than_allowed_but_for_a_single_item() -> None:
     double = Doubling(held=1)
-    gathering: Gathering[int, int] = Gathering(double, max_weight=10, weigh=lambda item: item)
+    gathering: Gathering[int, int] = Gathering(double, max_weight=lambda: 10, weigh=lambda item: item)
     with ThreadPoolExecutor(16) as pool:
         futures = [pool.submit(gathering, 1)]
         while not double.batches:
@@ -90,7 +90,9 @@ def test_what_ends_in_an_error_ends_so_for_all_of_its_batch_and_for_no_other() -
 
 
 def test_many_threads_get_what_is_theirs() -> None:
-    gathering: Gathering[int, int] = Gathering(lambda batch: [2 * item for item in batch], lanes=3, max_weight=5)
+    gathering: Gathering[int, int] = Gathering(
+        lambda batch: [2 * item for item in batch], lanes=3, max_weight=lambda: 5
+    )
     with ThreadPoolExecutor(32) as pool:
         assert list(pool.map(gathering, range(5000))) == [2 * number for number in range(5000)]
     gathering.wait_until_idle()

@@ -327,7 +327,7 @@ def test_of_several_at_a_time_each_stands_for_itself_in_one_commit(tmp_path: Pat
             Append(record("event", "last")),
         ]
     )
-    assert gate.commit_sizes == [1]
+    assert gate.commit_sizes == [1, 1], "what does not go at once is undone, and goes one by one"
     kinds = [type(outcome) for outcome in outcomes]
     assert kinds == [Appended, ConflictError, Appended, UnknownError, InvalidRequestError, Appended, Appended]
     assert [(o.sequence, o.was_known) for o in outcomes if isinstance(o, Appended)] == [
@@ -337,6 +337,40 @@ def test_of_several_at_a_time_each_stands_for_itself_in_one_commit(tmp_path: Pat
     assert [ledger.store.blob(entry(content).sha256) for content in (b"abc", b"long")] == [b"abc", b"long"]
     ledger.close()
     assert check(tmp_path / "session").is_sound
+
+
+@pytest.mark.parametrize("inline_bytes", [0, 1000], ids=["packed", "among the rows"])
+def test_what_comes_together_keeps_its_order_also_where_something_is_known(tmp_path: Path, inline_bytes: int) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100, inline_bytes=inline_bytes)
+    images = [b"same", b"same", b"other", b"third"]
+    together = [Append(record("keyframe", f"{n}"), [image], [entry(image)]) for n, image in enumerate(images)]
+    assert [o.sequence for o in ledger.store.append_all(together) if isinstance(o, Appended)] == [0, 1, 2, 3]
+    assert [row.record_id for row in ledger.store.read("keyframe")] == ["0", "1", "2", "3"]
+    ledger.close()
+
+
+def test_for_want_of_space_nothing_overtakes_what_was_refused(tmp_path: Path) -> None:
+    free = [1000]
+    ledger = open_ledger(
+        tmp_path / "session",
+        packed_blob_bytes=5000,
+        reserve_bytes=900,
+        free_bytes=lambda: free[0],
+    )
+    sizes = {"first": 50, "large": 600, "small": 1}
+    together = [
+        Append(record("keyframe", name), [bytes([n]) * size], [entry(bytes([n]) * size)])
+        for n, (name, size) in enumerate(sizes.items())
+    ]
+    outcomes = ledger.store.append_all([*together, Append(record("event", "other"))])
+    assert [type(outcome) for outcome in outcomes] == [Appended, DiskFullError, DiskFullError, Appended]
+    free[0] = 10**6
+    assert [type(outcome) for outcome in ledger.store.append_all(together)] == [Appended] * 3
+    assert [row.record_id for row in ledger.store.read("keyframe")] == ["first", "large", "small"]
+    free[0] = 950  # what is stored takes no space
+    referring = [Append(record("keyframe", f"{n}"), [], [entry(bytes([1]) * 600)]) for n in range(5)]
+    assert [type(outcome) for outcome in ledger.store.append_all(referring)] == [Appended] * 5
+    ledger.close()
 
 
 def test_when_the_commit_fails_nobody_in_it_is_acknowledged(ledger: Ledger) -> None:

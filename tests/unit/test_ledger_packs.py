@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -232,3 +233,67 @@ def test_a_folder_that_cannot_be_used_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "packs").write_bytes(b"a file")
     with pytest.raises(LedgerError, match=r"^cannot use .*packs for packs: .+$"):
         PackFiles(tmp_path / "packs")
+
+
+class FullFiles(FileOperations):
+    """Finds no space for what it is told to."""
+
+    fails_at: frozenset[int] = frozenset()
+
+    def write_blocks(self, path: Path, descriptor: int, offset_bytes: int, blocks: memoryview) -> None:
+        if offset_bytes in self.fails_at:
+            raise OSError(errno.ENOSPC, "injected")
+        super().write_blocks(path, descriptor, offset_bytes, blocks)
+
+
+@pytest.mark.parametrize("size_bytes", [5000, 600_000], ids=["at once", "in the background"])
+def test_a_place_that_was_given_up_is_never_written_again(tmp_path: Path, size_bytes: int) -> None:
+    """Not by whoever waits once more for what failed: it may be somebody else's."""
+    files = FullFiles()
+    files.fails_at = frozenset({0})
+    packs = PackFiles(tmp_path / "packs", files=files)
+    failed = packs.begin([b"x" * size_bytes])
+    with pytest.raises(DiskFullError):
+        failed.wait()
+    files.fails_at = frozenset()
+    (place,) = packs.append([b"mine"])
+    assert place.offset_bytes == 0
+    with pytest.raises(DiskFullError):
+        failed.wait()
+    assert packs.read(place) == b"mine"
+    packs.close()
+
+
+def test_rooms_that_are_given_up_in_any_order_are_used_again(tmp_path: Path) -> None:
+    files = FullFiles()
+    packs = PackFiles(tmp_path / "packs", files=files)
+    (kept,) = packs.append([b"kept"])
+    files.fails_at = frozenset(BLOCK_BYTES * number for number in (1, 2, 3))
+    writings = [packs.begin([b"%d" % number]) for number in range(3)]
+    for writing in (writings[1], writings[0], writings[2]):
+        with pytest.raises(DiskFullError):
+            writing.wait()
+    files.fails_at = frozenset()
+    assert packs.append([b"next"]) == [Place(1, BLOCK_BYTES, 4)]
+    assert packs.read(kept) == b"kept"
+    packs.close()
+
+
+def test_files_are_closed_only_when_nothing_is_being_written(tmp_path: Path) -> None:
+    files = GatedFiles(fails=False)
+    packs = PackFiles(tmp_path / "packs", files=files)
+    outcome: list[Any] = []
+    writing = threading.Thread(target=lambda: outcome.append(packs.append([bytes(100_000)])))
+    writing.start()
+    while files.sync_count == 0:
+        time.sleep(0.001)
+    closing = threading.Thread(target=packs.close)
+    closing.start()
+    time.sleep(0.05)
+    assert closing.is_alive()
+    with pytest.raises(LedgerError, match="the session is closed"):
+        packs.begin([bytes(600_000)])
+    files.release.set()
+    writing.join()
+    closing.join()
+    assert outcome == [[Place(1, 0, 100_000)]]

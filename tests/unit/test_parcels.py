@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from vggt_motion.bus import calls, codec, parcels
 from vggt_motion.bus.parcels import MIN_PARCEL_BYTES, MemoryParcels, Parcels, open_parcels
+from vggt_motion.bus.wire import Pieces
 from vggt_motion.config import BusConfig
 from vggt_motion.errors import BusUnavailableError
 
@@ -93,7 +94,7 @@ def test_without_space_nothing_is_left(
     assert sides[0].leave(LONG[:-8192]) is not None
 
 
-@pytest.mark.parametrize("name", ["fifo", "link", "short", "long", "folder", "missing"])
+@pytest.mark.parametrize("name", ["fifo", "link", "short", "folder", "missing"])
 def test_what_is_not_the_file_that_was_spoken_of_is_neither_read_nor_waited_for(
     sides: tuple[MemoryParcels, MemoryParcels], memory: Path, name: str
 ) -> None:
@@ -103,12 +104,11 @@ def test_what_is_not_the_file_that_was_spoken_of_is_neither_read_nor_waited_for(
     (folder / "target").write_bytes(bytes(100))
     (folder / "link").symlink_to(folder / "target")
     (folder / "short").write_bytes(bytes(99))
-    (folder / "long").write_bytes(bytes(101))
     (folder / "folder").mkdir()
     attachment = codec.encode(calls.Parcel(codec.decode(calls.Parcel, here.greeting or b"").folder_id, name, 100))
     with pytest.raises(BusUnavailableError):
         here.take(b"", attachment)
-    for path in ("fifo", "link", "short", "long", "target"):
+    for path in ("fifo", "link", "short", "target"):
         (folder / path).unlink()
     (folder / "folder").rmdir()
 
@@ -212,15 +212,74 @@ def test_a_link_in_the_place_of_a_folder_leads_nowhere(memory: Path, tmp_path_fa
 def test_a_parcel_that_meets_the_end_of_its_owner_is_not_left_behind(
     sides: tuple[MemoryParcels, MemoryParcels], memory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = parcels._write
+    real = parcels.Parcel.fill
 
-    def closing(path: Path, payload: bytes) -> None:
+    def closing(self: parcels.Parcel, payload: bytes, folder_id: str) -> None:
         sides[0].close()
-        real(path, payload)
+        real(self, payload, folder_id)
 
-    monkeypatch.setattr(parcels, "_write", closing)
+    monkeypatch.setattr(parcels.Parcel, "fill", closing)
     assert sides[0].leave(LONG) is None
     assert left_in(memory / "vggt_motion-0-session") == []
+
+
+def test_what_was_read_is_filled_again_under_another_name(
+    sides: tuple[MemoryParcels, MemoryParcels], memory: Path
+) -> None:
+    here, there = sides
+    folder = memory / "vggt_motion-0-session"
+    first = here.leave(LONG)
+    assert first is not None
+    known = first.attachment
+    here.take_back(first, is_read=True)
+    assert there.take(b"", known) == LONG, "its name is taken away when it is filled again"
+    second = here.leave(Pieces([LONG[::-1], b"", LONG]))
+    assert second is first and len(left_in(folder)) == 1
+    assert there.take(b"", second.attachment) == LONG[::-1] + LONG
+    with pytest.raises(BusUnavailableError):
+        there.take(b"", known)
+    here.take_back(second, is_read=True)
+    third = here.leave(LONG)
+    assert third is first and there.take(b"", third.attachment) == LONG, "shorter than what it held before"
+    here.take_back(third, is_read=False)
+    assert left_in(folder) == [], "whoever did not answer may read it yet: it is not filled again"
+    kept = [here.leave(bytes(5 * 2**20)) for _ in range(5)]
+    for parcel in kept:
+        assert parcel is not None
+        here.take_back(parcel, is_read=True)
+    assert len(left_in(folder)) == 3, "little memory is kept"
+
+
+def test_a_parcel_that_is_filled_again_while_it_is_read_is_not_taken(
+    sides: tuple[MemoryParcels, MemoryParcels], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = sides
+    parcel = here.leave(LONG)
+    assert parcel is not None
+    here.take_back(parcel, is_read=True)
+    known, real = parcel.attachment, os.read
+
+    def reading(descriptor: int, length: int) -> bytes:
+        content = real(descriptor, length)
+        assert here.leave(LONG[::-1]) is parcel
+        return content
+
+    monkeypatch.setattr(parcels.os, "read", reading)
+    with pytest.raises(BusUnavailableError, match="cannot be read"):
+        there.take(b"", known)
+
+
+@given(lengths=st.lists(st.integers(0, 3), min_size=1, max_size=1500))
+@settings(max_examples=20, deadline=None)
+def test_pieces_arrive_joined_however_many_they_are(
+    tmp_path_factory: pytest.TempPathFactory, lengths: list[int]
+) -> None:
+    side = MemoryParcels(tmp_path_factory.mktemp("memory") / "vggt_motion-0-pieces")
+    pieces = Pieces([LONG, *(bytes([at % 256]) * length for at, length in enumerate(lengths)), memoryview(LONG)])
+    parcel = side.leave(pieces)
+    assert parcel is not None
+    assert side.take(b"", parcel.attachment) == pieces.joined()
+    side.close()
 
 
 def test_sessions_and_endpoints_have_folders_of_their_own(memory: Path) -> None:

@@ -8,7 +8,7 @@ from vggt_motion.bus.wire import DELIMITED, MalformedError, delimited, fields
 LIFTED_FROM_BYTES = 2**16  # below this the copies cost less
 
 
-def lift(payload: bytes, plan: Plan) -> tuple[bytes, tuple[memoryview, ...] | None]:
+def lift(payload: bytes | memoryview, plan: Plan) -> tuple[bytes | memoryview, tuple[memoryview, ...] | None]:
     """Part a message from the contents of its bulk field.
 
     Args:

@@ -1,9 +1,10 @@
-"""The calls of ledger and job queue as frozen dataclasses: ``ledger.proto``, ``jobs.proto`` and ``parcel.proto``."""
+"""The calls of ledger and job queue, and what carries them, as frozen dataclasses: ``proto/vggt_motion/v1``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from vggt_motion.bus.wire import Pieces
 from vggt_motion.errors import RefusalCode
 from vggt_motion.records import BlobRef, DoneOutcome, Job, JobKind, JobReport, JobState, Lease, LogEntry
 
@@ -23,6 +24,28 @@ class Parcel:
     folder_id: str
     name: str = ""  # of a file in the folder; empty: the payload is in the message
     size_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Several requests to one key in one message."""
+
+    requests: tuple[bytes | memoryview | Pieces, ...]
+
+
+@dataclass(frozen=True)
+class BundledAnswer:
+    """What became of one of them."""
+
+    payload: bytes
+    refusal: Refusal | None = None
+
+
+@dataclass(frozen=True)
+class BundleReply:
+    """In the order of the bundle."""
+
+    answers: tuple[BundledAnswer, ...]
 
 
 @dataclass(frozen=True)

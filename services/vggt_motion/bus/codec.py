@@ -15,11 +15,12 @@ from google.protobuf.message import DecodeError, EncodeError, Message
 from vggt_motion.bus.bulk import LIFTED_FROM_BYTES, lift
 from vggt_motion.bus.contract.calls import CALL_PLANS
 from vggt_motion.bus.contract.records import RECORD_PLANS
-from vggt_motion.bus.contract.values import MAX_BLOB_BYTES, MAX_BLOBS_PER_REQUEST
+from vggt_motion.bus.contract.values import MAX_BLOB_BYTES, MAX_BLOBS_PER_REQUEST, MAX_REQUESTS_PER_BUNDLE
 from vggt_motion.bus.depth import MEDIA_TYPE as DEPTH_MEDIA_TYPE
-from vggt_motion.bus.depth import decode_depth, encode_depth
+from vggt_motion.bus.depth import check_depth, decode_depth, encode_depth
 from vggt_motion.bus.scan import check_structure
 from vggt_motion.bus.schema import FieldError, Plan
+from vggt_motion.bus.wire import Payload, Pieces, joined
 from vggt_motion.errors import CodecError
 from vggt_motion.records import BlobRef, Constraint, Event, GraphUpdate, Keyframe, Segment, Stream, SubmapGeometry
 
@@ -27,15 +28,18 @@ __all__ = [
     "DEPTH_MEDIA_TYPE",
     "MAX_BLOBS_PER_REQUEST",
     "MAX_BLOB_BYTES",
+    "MAX_REQUESTS_PER_BUNDLE",
     "SCHEMA_VERSION",
     "STREAM_RECORDS",
     "Record",
     "blob_ref",
     "blob_refs",
+    "check_depth",
     "decode",
     "decode_depth",
     "encode",
     "encode_depth",
+    "encode_in_pieces",
     "encode_with_identity",
     "encoding_of",
     "identity_digest",
@@ -57,6 +61,7 @@ Record: TypeAlias = Keyframe | Segment | SubmapGeometry | Constraint | GraphUpda
 """What a stream of the log may hold."""
 
 _Message = TypeVar("_Message")
+_Bytes = TypeVar("_Bytes", bound=bytes | memoryview | Pieces)
 
 _PLANS: Final = (*RECORD_PLANS, *CALL_PLANS)
 _BY_CLASS: Final = {plan.record: plan for plan in _PLANS}
@@ -70,16 +75,24 @@ def encode(record: Any) -> bytes:
     Raises:
         CodecError: a value breaks a rule of the wire; the message names the field.
     """
+    return joined(encode_in_pieces(record))
+
+
+def encode_in_pieces(record: Any) -> Payload:
+    """:func:`encode`, without a copy of what is megabytes long: blobs, and the requests of a bundle.
+
+    Raises:
+        CodecError: see there.
+    """
     plan = _plan_of(type(record))
     if not plan.has_bulk:
         return _serialise(_message(plan, record), plan)
     try:
-        pieces = plan.pieces(record, _empty(plan))
+        return _bounded(Pieces(plan.pieces(record, _empty(plan))), plan)
     except FieldError as error:
         raise _codec_error(plan, error) from None
     except (EncodeError, ValueError) as error:
         raise CodecError(f"{plan.full_name}: cannot be serialised: {_one_line(error)}") from None
-    return _bounded(b"".join(pieces), plan)
 
 
 def encode_with_identity(record: Any) -> tuple[bytes, bytes]:
@@ -89,10 +102,10 @@ def encode_with_identity(record: Any) -> tuple[bytes, bytes]:
     return _serialise(message, plan), _identity(message, plan)
 
 
-def decode(cls: type[_Message], payload: bytes) -> _Message:
+def decode(cls: type[_Message], payload: bytes | memoryview) -> _Message:
     """Parse and check a record or call; the inverse of :func:`encode`.
 
-    The blobs of a long request are views of ``payload``, not copies.
+    The blobs of a long request, and the requests of a long bundle, are views of ``payload``, not copies.
 
     Raises:
         CodecError: one line that names the type and the field that is wrong.
@@ -105,7 +118,7 @@ def decode(cls: type[_Message], payload: bytes) -> _Message:
         payload, lifted = lift(payload, plan)
     message = plan.message()
     try:
-        message.ParseFromString(payload)
+        message.ParseFromString(bytes(payload))
     except (DecodeError, ValueError) as error:
         raise CodecError(f"{plan.full_name}: not a valid message: {_one_line(error)}") from None
     if cls in _VERSIONED:
@@ -158,20 +171,7 @@ def blob_ref(content: bytes, media_type: str) -> BlobRef:
 
 def blob_refs(record: Any) -> tuple[BlobRef, ...]:
     """Every blob that a record refers to, once, in order of appearance."""
-    found: list[BlobRef] = []
-    _gather_blob_refs(record, found)
-    return tuple(dict.fromkeys(found))
-
-
-def _gather_blob_refs(value: object, found: list[BlobRef]) -> None:
-    if isinstance(value, BlobRef):
-        found.append(value)
-    elif isinstance(value, tuple):
-        for entry in value:
-            _gather_blob_refs(entry, found)
-    else:
-        for name in getattr(value, "__dataclass_fields__", ()):
-            _gather_blob_refs(getattr(value, name), found)
+    return tuple(dict.fromkeys(_plan_of(type(record)).parts(record, BlobRef)))
 
 
 def _plan_of(cls: type[Any]) -> Plan:
@@ -210,7 +210,7 @@ def _identity(message: Message, plan: Plan) -> bytes:
     return hashlib.sha256(plan.full_name.encode() + b"\0" + _serialise(message, plan)).digest()
 
 
-def _bounded(payload: bytes, plan: Plan) -> bytes:
+def _bounded(payload: _Bytes, plan: Plan) -> _Bytes:
     if len(payload) > plan.max_bytes:
         raise CodecError(f"{plan.full_name}: {len(payload)} bytes are more than the allowed {plan.max_bytes}")
     return payload

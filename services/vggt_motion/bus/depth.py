@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
+import threading
 import zlib
 
 import numpy as np
@@ -32,7 +33,9 @@ _TOP_EXPONENT = 15  # scaled depth is at most 2**15, well inside float16
 _MIN_EXPONENT, _MAX_EXPONENT = -112, 111  # 2**e times any normal float16 is a normal float32
 _MAX_DEPTH = 2.0**126
 _MIN_NORMAL = np.float32(2.0**-14)
+_MIN_HIGH_BYTE, _MAX_HIGH_BYTE = 0x04, 0x7B  # of a normal float16 that is not negative
 _LEVEL = 1
+_of_thread = threading.local()
 
 Depth = npt.NDArray[np.float32]
 
@@ -93,6 +96,27 @@ def decode_depth(payload: bytes | memoryview) -> tuple[Depth, Depth]:
     Raises:
         CodecError: not a depth blob, damaged, of a newer version, too large, or with a value that no encoder writes.
     """
+    (height, width), exponent, planes = _planes(payload)
+    interleaved = np.empty((height * width, 2), dtype=np.uint8)
+    interleaved[:, 0] = planes[0]
+    interleaved[:, 1] = planes[1]
+    bits = interleaved.reshape(-1).view("<f2")
+    depth = np.ldexp(bits.astype(np.float32), exponent).reshape(height, width)
+    confidence = (planes[2].astype(np.float32) * np.float32(1.0 / 255.0)).reshape(height, width)
+    return depth, confidence
+
+
+def check_depth(payload: bytes | memoryview) -> tuple[int, int]:
+    """Whether :func:`decode_depth` takes a blob; returns its height and width in pixels.
+
+    Raises:
+        CodecError: see there.
+    """
+    return _planes(payload)[0]
+
+
+def _planes(payload: bytes | memoryview) -> tuple[tuple[int, int], int, npt.NDArray[np.uint8]]:
+    """Height and width, scale exponent, and low bytes, high bytes and confidence (3, H * W); checked."""
     if len(payload) < _HEADER_BYTES or payload[:4] != _MAGIC:
         raise CodecError("depth blob: not a depth blob")
     _, version, reserved, exponent, width, height = _FIELDS.unpack_from(payload)
@@ -103,22 +127,17 @@ def decode_depth(payload: bytes | memoryview) -> tuple[Depth, Depth]:
     _check_size(width, height)
     if not _MIN_EXPONENT <= exponent <= _MAX_EXPONENT:
         raise CodecError(f"depth blob: scale exponent {exponent} is out of range")
-    pixels = width * height
-    raw = _decompress(payload[_HEADER_BYTES:], _BYTES_PER_PIXEL * pixels)
-    planes = np.frombuffer(raw, dtype=np.uint8)
-    interleaved = np.empty((pixels, 2), dtype=np.uint8)
-    interleaved[:, 0] = planes[:pixels]
-    interleaved[:, 1] = planes[pixels : 2 * pixels]
-    bits = interleaved.reshape(-1).view("<u2")
-    # Of float16 bits, 0 and the positive normal numbers are valid; 0x7C00 is infinity, NaN and negative ones lie above.
-    if bool(np.any((bits >= 0x7C00) | ((bits < 0x0400) & (bits != 0)))):
+    raw = _decompress(payload[_HEADER_BYTES:], _BYTES_PER_PIXEL * width * height)
+    planes = np.frombuffer(raw, dtype=np.uint8).reshape(_BYTES_PER_PIXEL, width * height)
+    low, high, levels = planes
+    # Of float16 bits, 0 and the positive normal numbers are valid, which by their high bytes are 0x04 to 0x7B: 0x7C00
+    # is infinity, NaN and negative ones lie above, and what lies below is zero or too small to be normal.
+    is_small = high < _MIN_HIGH_BYTE
+    if bool((high > _MAX_HIGH_BYTE).any()) or bool((is_small & ((low | high) != 0)).any()):
         raise CodecError("depth blob: depth must be finite, not negative and at float16 precision")
-    levels = planes[2 * pixels :]
-    if bool(np.any((bits == 0) & (levels != 0))):
+    if bool((is_small & (levels != 0)).any()):
         raise CodecError("depth blob: confidence without depth")
-    depth = np.ldexp(bits.view("<f2").astype(np.float32), exponent).reshape(height, width)
-    confidence = (levels.astype(np.float32) * np.float32(1.0 / 255.0)).reshape(height, width)
-    return depth, confidence
+    return (height, width), exponent, planes
 
 
 def _check_size(width: int, height: int) -> None:
@@ -126,13 +145,19 @@ def _check_size(width: int, height: int) -> None:
         raise CodecError(f"depth blob: size {width} x {height} px is out of range")
 
 
+def _zstd() -> zstandard.ZstdDecompressor:
+    """One for each thread: making one costs as much as a small frame, and two threads may not share it."""
+    if not hasattr(_of_thread, "decompressor"):
+        _of_thread.decompressor = zstandard.ZstdDecompressor(max_window_size=2**27)
+    decompressor: zstandard.ZstdDecompressor = _of_thread.decompressor
+    return decompressor
+
+
 def _decompress(frame: bytes | memoryview, expected_bytes: int) -> bytes:
     try:
         if zstandard.get_frame_parameters(frame).content_size != expected_bytes:
             raise CodecError("depth blob: content has another size than the header declares")
-        raw = zstandard.ZstdDecompressor(max_window_size=2**27).decompress(
-            frame, max_output_size=expected_bytes, allow_extra_data=False
-        )
+        raw = _zstd().decompress(frame, max_output_size=expected_bytes, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise CodecError(f"depth blob: damaged: {error}") from error
     if len(raw) != expected_bytes:

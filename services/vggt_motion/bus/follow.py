@@ -11,17 +11,20 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
-from vggt_motion.bus import codec
+from vggt_motion.bus import calls, codec
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.session import Bus, Sample
 from vggt_motion.errors import BusUnavailableError, CodecError, LedgerError, VggtMotionError
 from vggt_motion.records import LogEntry
 
 _log = logging.getLogger(__name__)
+SEVERAL_ENTRIES: Final = codec.encoding_of(calls.ReadReply)
+"""Encoding of a publication of records that became durable together."""
+
 POLL_S = 2.0  # a lost last message shows up after this at the latest
 _GAP_PATIENCE_S = 0.05  # a gap may close by itself: live messages can overtake the answer to a read
 _RETRY_S = 0.25
@@ -153,8 +156,7 @@ class Follower(Generic[FollowedRecord]):
         self._thread.join(_JOIN_S)
 
     def _on_sample(self, sample: Sample) -> None:
-        entry = published_entry(sample)
-        if entry is not None:
+        for entry in published_entries(sample):
             self.offer(entry)
 
     def _run(self) -> None:
@@ -245,10 +247,12 @@ class Follower(Generic[FollowedRecord]):
                 self._on_news()
 
 
-def published_entry(sample: Sample) -> LogEntry | None:
-    """What a publication of the log holds; None, and a warning, where it is none."""
+def published_entries(sample: Sample) -> Sequence[LogEntry]:
+    """What a publication of the log holds; nothing, and a warning, where it is none."""
     try:
-        return codec.decode(LogEntry, sample.payload)
+        if sample.encoding == SEVERAL_ENTRIES:
+            return codec.decode(calls.ReadReply, sample.payload).entries
+        return (codec.decode(LogEntry, sample.payload),)
     except CodecError as error:
         _log.warning("not a log entry, passed over", extra={"key": sample.key, "reason": str(error)})
-        return None
+        return ()

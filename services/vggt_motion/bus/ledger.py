@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.retry import retry
 from vggt_motion.bus.session import Bus
-from vggt_motion.errors import CodecError, LedgerError
+from vggt_motion.bus.wire import Payload
+from vggt_motion.errors import CodecError, DiskFullError, LedgerError, VggtMotionError
 from vggt_motion.records import BlobRef, LedgerStatus, LogEntry
 
 _BLOB_PATIENCE_S = 15.0
@@ -69,8 +70,8 @@ class LedgerClient:
     ) -> AppendResult:
         """Make a record durable, with the blobs that it refers to and that the ledger may not have yet.
 
-        Returns only when it is on disk. While the ledger or the link is down, tries again: for ``patience_s``, or for
-        ever.
+        Returns only when it is on disk; what several threads append at a time travels together. While the ledger or
+        the link is down, tries again: for ``patience_s``, or for ever.
 
         Raises:
             BusUnavailableError: patience is at its end, or the process was told to stop; whether it was stored is not
@@ -80,18 +81,52 @@ class LedgerClient:
             CodecError: the record breaks a rule of the wire.
         """
         request = append_request(stream, record_id, record, blobs)
-        return self.append_encoded(codec.encode(request), patience_s=patience_s, what=record_id)
+        return self.append_encoded(codec.encode_in_pieces(request), patience_s=patience_s, what=record_id)
 
-    def append_encoded(self, payload: bytes, *, patience_s: float | None = None, what: str = "record") -> AppendResult:
+    def append_encoded(
+        self, payload: Payload, *, patience_s: float | None = None, what: str = "record"
+    ) -> AppendResult:
         """As :meth:`append`, of an :class:`.calls.AppendRequest` that was encoded before."""
         key = self._bus.keys.rpc("ledger", "append")
         reply = retry(
             self._bus,
-            lambda: codec.decode(calls.AppendReply, self._bus.request(key, payload)),
+            lambda: codec.decode(calls.AppendReply, self._bus.request_among_others(key, payload)),
             patience_s=patience_s,
             what=f"append {what}",
         )
         return AppendResult(reply.sequence, reply.was_known)
+
+    def append_all_encoded(
+        self, payloads: Sequence[Payload], *, what: str = "records"
+    ) -> list[AppendResult | VggtMotionError]:
+        """As :meth:`append_encoded` of several in order, in few round trips.
+
+        Returns:
+            What became of each: where it was refused, why.
+
+        Raises:
+            BusUnavailableError: the process was told to stop.
+        """
+        key = self._bus.keys.rpc("ledger", "append")
+        results: list[AppendResult | VggtMotionError] = []
+        while len(results) < len(payloads):
+            rest = payloads[len(results) :]
+            answers = retry(
+                self._bus,
+                lambda rest=rest: self._bus.request_all(key, rest),  # type: ignore[misc]
+                patience_s=None,
+                what=f"append {what} and others",
+            )
+            for answer in answers:
+                if isinstance(answer, VggtMotionError):
+                    results.append(answer)
+                else:
+                    reply = codec.decode(calls.AppendReply, answer)
+                    results.append(AppendResult(reply.sequence, reply.was_known))
+            full = next((result for result in results if isinstance(result, DiskFullError)), None)
+            if full is not None:  # the others may not overtake it
+                results += [full] * (len(payloads) - len(results))
+        return results
 
     def read(self, stream: str, from_sequence: int, limit: int = 0, *, patience_s: float = 0.0) -> list[LogEntry]:
         """Entries of a stream from a sequence number on, in order and without gap.

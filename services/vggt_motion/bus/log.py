@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 
-from vggt_motion.bus.follow import POLL_S, Follower, published_entry
+from vggt_motion.bus.follow import POLL_S, Follower, published_entries
 from vggt_motion.bus.keys import last_chunk
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.session import Bus, Sample
@@ -96,9 +96,9 @@ class LogFollower:
 
     def _on_sample(self, sample: Sample) -> None:
         follower = self._by_name.get(last_chunk(sample.key))
-        entry = published_entry(sample) if follower is not None else None
-        if follower is not None and entry is not None:
-            follower.offer(entry)
+        if follower is not None:
+            for entry in published_entries(sample):
+                follower.offer(entry)
 
     def _watch(self) -> None:
         """Ask the ledger for the ends of all streams now and then: a publication may be lost."""

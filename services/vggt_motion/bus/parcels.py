@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import hashlib
 import itertools
 import logging
@@ -24,35 +25,72 @@ from pathlib import Path
 from typing import Final
 
 from vggt_motion.bus import calls, codec
+from vggt_motion.bus.wire import Payload, joined, parts_of
 from vggt_motion.config import BusConfig
 from vggt_motion.errors import BusUnavailableError, CodecError
 from vggt_motion.locks import try_lock
 
 _log = logging.getLogger(__name__)
 
-MIN_PARCEL_BYTES: Final = 128 * 2**10
-"""Shorter payloads are sent: measured, a file costs more than a message up to 100 kB, and less from 200 kB on."""
+MIN_PARCEL_BYTES: Final = 64 * 2**10
+"""Shorter payloads are sent: measured, a file costs more than a message of 60 kB, and less than one of 100 kB."""
 
 _MEMORY = Path("/dev/shm")  # where every Linux has memory as a file system
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _KEPT_FREE = 3  # as many times a parcel's size must be free in memory
 _ANSWER_LIFE_S = 60.0
+_MAX_IDLE_BYTES = 16 * 2**20
+_MAX_ATTACHMENT_BYTES = 256  # of one that says where a parcel is
+_MAX_PARTS = 512  # in one call; Linux allows 1024
 _JOIN_ATTEMPTS = 100
 
 
 class Parcel:
     """A file that this process has left for another."""
 
-    def __init__(self, folder: Path, folder_id: str, name: str, size_bytes: int) -> None:
-        self._path = folder / name
-        self.size_bytes = size_bytes
-        self.attachment = codec.encode(calls.Parcel(folder_id, name, size_bytes))
-        self.ends_s = time.monotonic() + _ANSWER_LIFE_S
+    def __init__(self, path: str, descriptor: int) -> None:
+        self._path = path
+        self._descriptor: int | None = descriptor
+        self.capacity_bytes = 0  # length of the file, which may have held more before
+        self.attachment = b""
+        self.ends_s = 0.0
+
+    def rename(self, path: str) -> None:
+        """Take the file from whoever still knows its name, before it is filled again.
+
+        Raises:
+            OSError: it is not there any more.
+        """
+        os.rename(self._path, path)  # noqa: PTH104 (here and below: a Path costs as much as the call)
+        self._path = path
+
+    def fill(self, payload: Payload, folder_id: str) -> None:
+        """Put a payload into the file.
+
+        Raises:
+            OSError: there is no space.
+        """
+        assert self._descriptor is not None
+        written = os.pwritev(self._descriptor, parts_of(payload)[:_MAX_PARTS], 0)
+        if written < len(payload):
+            rest = memoryview(joined(payload))[written:]
+            while rest:
+                count = os.pwrite(self._descriptor, rest, len(payload) - len(rest))
+                rest = rest[count:]
+        self.capacity_bytes = max(self.capacity_bytes, len(payload))
+        self.attachment = codec.encode(calls.Parcel(folder_id, self._path.rpartition(os.sep)[2], len(payload)))
+
+    def seal(self) -> None:
+        """It is not filled again."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
 
     def remove(self) -> None:
         """Delete the file, if its reader has not."""
+        self.seal()
         with contextlib.suppress(OSError):
-            self._path.unlink()
+            os.unlink(self._path)  # noqa: PTH108
 
 
 class Parcels:
@@ -61,11 +99,14 @@ class Parcels:
     greeting: bytes | None = None
     """Attachment of a message that carries its payload itself."""
 
-    def leave(self, payload: bytes) -> Parcel | None:
+    def leave(self, payload: Payload) -> Parcel | None:
         """Leave a payload for the other side, which says that it uses the same folder; None: send it."""
         return None
 
-    def leave_answer(self, payload: bytes) -> Parcel | None:
+    def take_back(self, parcel: Parcel, *, is_read: bool) -> None:
+        """End of what was left; ``is_read``: the other side has answered, and does not look at it any more."""
+
+    def leave_answer(self, payload: Payload) -> Parcel | None:
         """As :meth:`leave`; it is removed by its reader, or after a while."""
         return None
 
@@ -77,10 +118,8 @@ class Parcels:
         """Length of the payload that a message stands for; 0 if it carries it itself."""
         if attachment is None or attachment == self.greeting:
             return 0
-        try:
-            return codec.decode(calls.Parcel, attachment).size_bytes
-        except CodecError:
-            return 0
+        parcel = _decoded(attachment)
+        return 0 if parcel is None else parcel.size_bytes
 
     def take(self, payload: bytes, attachment: bytes | None, *, is_last_reader: bool = False) -> bytes:
         """The payload of a message, or what was left in its stead.
@@ -117,9 +156,11 @@ class MemoryParcels(Parcels):
             OSError: that is not possible here.
         """
         self._folder = folder
+        self._folder_name = str(folder)
         self._prefix = secrets.token_hex(8)
         self._numbers = itertools.count()
         self._lock = threading.Lock()
+        self._idle: list[Parcel] = []  # requests that were answered
         self._answers: deque[Parcel] = deque()
         self._timer: threading.Timer | None = None  # that removes the oldest answer when its time is over
         self._is_closed = False
@@ -135,31 +176,48 @@ class MemoryParcels(Parcels):
         for other in folder.parent.glob(f"{folder.name.rsplit('-', 1)[0]}-*"):
             _clear_up(other)
 
-    def leave(self, payload: bytes) -> Parcel | None:
+    def leave(self, payload: Payload) -> Parcel | None:
         """See :meth:`Parcels.leave`."""
         if len(payload) < MIN_PARCEL_BYTES or self._is_closed:
             return None
-        name = f"{self._prefix}-{next(self._numbers)}"
-        path = self._folder / name
+        with self._lock:
+            parcel = self._idle.pop() if self._idle else None
         try:
-            space = os.statvfs(self._folder)
-            if space.f_bavail * space.f_frsize < _KEPT_FREE * len(payload):
-                return None
-            _write(path, payload)
+            if parcel is None or parcel.capacity_bytes < len(payload):
+                space = os.statvfs(self._folder)
+                if space.f_bavail * space.f_frsize < _KEPT_FREE * len(payload):
+                    raise OSError(errno.ENOSPC, "little space is left")
+            path = f"{self._folder_name}{os.sep}{self._prefix}-{next(self._numbers)}"
+            if parcel is None:
+                parcel = Parcel(path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+            else:
+                parcel.rename(path)
+            parcel.fill(payload, self._folder_id)
             if self._is_closed:
                 raise OSError(errno.EBADF, "closed meanwhile")
         except OSError as error:
-            with contextlib.suppress(OSError):
-                path.unlink()
+            if parcel is not None:
+                parcel.remove()
             _log.debug("no parcel", extra={"folder": str(self._folder), "reason": error.strerror})
             return None
-        return Parcel(self._folder, self._folder_id, name, len(payload))
+        return parcel
 
-    def leave_answer(self, payload: bytes) -> Parcel | None:
+    def take_back(self, parcel: Parcel, *, is_read: bool) -> None:
+        """See :meth:`Parcels.take_back`. The file is used again: its memory need not be found and cleared anew."""
+        with self._lock:
+            kept_bytes = parcel.capacity_bytes + sum(idle.capacity_bytes for idle in self._idle)
+            if is_read and not self._is_closed and kept_bytes <= _MAX_IDLE_BYTES:
+                self._idle.append(parcel)
+                return
+        parcel.remove()
+
+    def leave_answer(self, payload: Payload) -> Parcel | None:
         """See :meth:`Parcels.leave_answer`."""
         parcel = self.leave(payload)
         if parcel is None:
             return None
+        parcel.seal()
+        parcel.ends_s = time.monotonic() + _ANSWER_LIFE_S
         with self._lock:
             if not self._is_closed:
                 self._answers.append(parcel)
@@ -182,11 +240,12 @@ class MemoryParcels(Parcels):
         parcel = self._parcel(attachment)
         if parcel is None:
             return super().take(payload, attachment)
-        path = self._folder / parcel.name
+        path = f"{self._folder_name}{os.sep}{parcel.name}"
         try:
             content = _read(path, parcel.size_bytes)
             if is_last_reader:
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(path)  # noqa: PTH108
         except OSError as error:
             raise BusUnavailableError(f"what was left for this process cannot be read ({error.strerror})") from None
         if len(content) != parcel.size_bytes:
@@ -201,9 +260,10 @@ class MemoryParcels(Parcels):
             self._is_closed = True
             if self._timer is not None:
                 self._timer.cancel()
-            answers = list(self._answers)
+            kept = [*self._answers, *self._idle]
             self._answers.clear()
-        for parcel in answers:
+            self._idle.clear()
+        for parcel in kept:
             parcel.remove()
         os.close(self._lock_descriptor)
         _clear_up(self._folder)
@@ -226,11 +286,8 @@ class MemoryParcels(Parcels):
             parcel.remove()
 
     def _parcel(self, attachment: bytes) -> calls.Parcel | None:
-        try:
-            parcel = codec.decode(calls.Parcel, attachment)
-        except CodecError:
-            return None
-        return parcel if parcel.folder_id == self._folder_id and parcel.name else None
+        parcel = _decoded(attachment)
+        return parcel if parcel is not None and parcel.folder_id == self._folder_id and parcel.name else None
 
 
 def open_parcels(config: BusConfig) -> Parcels:
@@ -245,24 +302,31 @@ def open_parcels(config: BusConfig) -> Parcels:
         return Parcels()
 
 
-def _write(path: Path, payload: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+def _decoded(attachment: bytes) -> calls.Parcel | None:
+    """What an attachment says; None: it is none of a parcel."""
+    return _remembered(attachment) if len(attachment) <= _MAX_ATTACHMENT_BYTES else None
+
+
+@functools.lru_cache(64)
+def _remembered(attachment: bytes) -> calls.Parcel | None:
+    """Each is looked at several times."""
     try:
-        view = memoryview(payload)
-        while view:
-            view = view[os.write(descriptor, view) :]
-    finally:
-        os.close(descriptor)
+        return codec.decode(calls.Parcel, attachment)
+    except CodecError:
+        return None
 
 
-def _read(path: Path, size_bytes: int) -> bytes:
-    """So many bytes of a plain file of this length; whatever else stands under the name is not waited for."""
+def _read(path: str, size_bytes: int) -> bytes:
+    """The first bytes of a plain file; whatever else stands under the name is not waited for."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_size != size_bytes:
+        if not stat.S_ISREG(found.st_mode) or found.st_size < size_bytes:
             raise OSError(errno.EINVAL, "not the file that was spoken of")
-        return os.read(descriptor, size_bytes)
+        content = os.read(descriptor, size_bytes)
+        if os.lstat(path).st_ino != found.st_ino:  # its writer takes the name away before it uses the file again
+            raise OSError(errno.ESTALE, "not the file that was spoken of any more")
+        return content
     finally:
         os.close(descriptor)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Protocol
 
@@ -39,15 +38,40 @@ class Closable(Protocol):
         """End it."""
 
 
-@dataclass(frozen=True)
 class Sample:
-    """One received message."""
+    """One received message; what is not asked for is not taken out of it."""
 
-    key: str
-    payload: bytes = field(repr=False)
-    timestamp_ns: int | None  # given by the publisher, else by the router; to about a nanosecond
-    attachment: bytes
-    encoding: str
+    __slots__ = ("_received", "key")
+
+    def __init__(self, received: zenoh.Sample) -> None:
+        """Wrap what Zenoh delivered."""
+        self._received = received
+        self.key = str(received.key_expr)
+
+    @property
+    def payload(self) -> bytes:
+        """The message, copied each time it is asked for."""
+        return self._received.payload.to_bytes()
+
+    @property
+    def timestamp_ns(self) -> int | None:
+        """Unix time given by the publisher, else by the router; to about a nanosecond."""
+        timestamp = self._received.timestamp
+        if timestamp is None:
+            return None
+        time = timestamp.get_time_as_ntp64()
+        return int(time.as_secs() * _NS_PER_S + time.subsec_nanos())
+
+    @property
+    def attachment(self) -> bytes:
+        """What travels beside the message."""
+        attachment = self._received.attachment
+        return b"" if attachment is None else attachment.to_bytes()
+
+    @property
+    def encoding(self) -> str:
+        """What the message is, as its publisher says."""
+        return str(self._received.encoding)
 
 
 class Publisher:
@@ -80,13 +104,16 @@ class Publisher:
                 reliability=zenoh.Reliability.RELIABLE,
             )
 
-    def put(self, payload: bytes, *, timestamp_ns: int | None = None, attachment: bytes = b"") -> None:
+    def put(
+        self, payload: bytes, *, timestamp_ns: int | None = None, attachment: bytes = b"", encoding: str = ""
+    ) -> None:
         """Publish.
 
         Args:
             payload: the message.
             timestamp_ns: Unix time to travel with it; None lets the router put its own.
             attachment: small bytes beside the payload.
+            encoding: in place of the publisher's own.
 
         Raises:
             BusUnavailableError: the session is closed.
@@ -99,7 +126,8 @@ class Publisher:
             seconds, nanoseconds = divmod(timestamp_ns, _NS_PER_S)
             timestamp = zenoh.Timestamp(zenoh.NTP64(seconds, nanoseconds), self._timestamp_id)
         try:
-            self._publisher.put(payload, attachment=attachment or None, timestamp=timestamp)
+            options = {"encoding": encoding} if encoding else {}
+            self._publisher.put(payload, attachment=attachment or None, timestamp=timestamp, **options)
         except zenoh.ZError as error:
             raise BusUnavailableError(f"{self._key}: cannot publish: {_one_line(error)}") from None
 
@@ -172,7 +200,7 @@ class Subscription:
         if self.is_closed or received.kind != zenoh.SampleKind.PUT:
             return
         try:
-            self._callback(_to_sample(received))
+            self._callback(Sample(received))
         except Exception:
             _log.exception("a subscriber's callback failed; the message is passed over", extra={"key": self._key})
 
@@ -212,20 +240,6 @@ class Token:
         """Take it back."""
         self.is_closed = True
         _undeclare(self._token)
-
-
-def _to_sample(received: zenoh.Sample) -> Sample:
-    timestamp_ns = None
-    if received.timestamp is not None:
-        time = received.timestamp.get_time_as_ntp64()
-        timestamp_ns = time.as_secs() * _NS_PER_S + time.subsec_nanos()
-    return Sample(
-        key=str(received.key_expr),
-        payload=received.payload.to_bytes(),
-        timestamp_ns=timestamp_ns,
-        attachment=received.attachment.to_bytes() if received.attachment is not None else b"",
-        encoding=str(received.encoding),
-    )
 
 
 def _timestamp_id(session: zenoh.Session) -> zenoh.TimestampId:

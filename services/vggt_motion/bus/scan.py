@@ -20,7 +20,7 @@ _OPAQUE_FROM_BYTES = 2**12
 _DESCEND_FROM_BYTES = 2**16
 
 
-def check_structure(payload: bytes, descriptor: Any) -> None:
+def check_structure(payload: bytes | memoryview, descriptor: Any) -> None:
     """Refuse a message that would unfold into far more memory than it is long.
 
     Raises:
@@ -36,7 +36,7 @@ class _Scan:
         self._elements = 0
         self._structure_bytes = 0
 
-    def message(self, data: bytes, begin: int, end: int, descriptor: Any) -> None:
+    def message(self, data: bytes | memoryview, begin: int, end: int, descriptor: Any) -> None:
         known = descriptor.fields_by_number if descriptor is not None else {}
         try:
             for found in fields(data, begin, end):

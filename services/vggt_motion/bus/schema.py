@@ -11,16 +11,19 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from google.protobuf.internal.enum_type_wrapper import EnumTypeWrapper
 from google.protobuf.message import Message
 
-from vggt_motion.bus.wire import delimited
+from vggt_motion.bus.wire import Pieces, delimited, parts_of
 
 _CONTROL = re.compile("[\x00-\x1f\x7f\x85\u2028\u2029]")
 _CONTROL_BUT_LINES = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+
+
+Part = TypeVar("Part")
 
 
 class FieldError(ValueError):
@@ -60,7 +63,7 @@ class Rule:
         """Read a repeated field."""
         return [self.check(value) for value in container]
 
-    def pieces(self, number: int, value: Any) -> list[bytes]:
+    def pieces(self, number: int, value: Any) -> list[bytes | memoryview]:
         """The field as it stands on the wire under this number, in pieces, without a copy of what is long."""
         raise NotImplementedError
 
@@ -159,14 +162,14 @@ class Raw(Rule):
     min_bytes: int = 0
 
     def check(self, value: Any) -> Any:
-        if not isinstance(value, (bytes, memoryview)):
+        if not isinstance(value, (bytes, memoryview, Pieces)):
             raise FieldError(f"must be bytes, not {type(value).__name__}")
         if not self.min_bytes <= len(value) <= self.max_bytes:
             raise FieldError(f"has {len(value)} bytes, allowed are {self.min_bytes} to {self.max_bytes}")
         return value
 
-    def pieces(self, number: int, value: Any) -> list[bytes]:
-        return [delimited(number, len(self.check(value))), value]
+    def pieces(self, number: int, value: Any) -> list[bytes | memoryview]:
+        return [delimited(number, len(self.check(value))), *parts_of(value)]
 
 
 class Choice(Rule):
@@ -248,7 +251,7 @@ class Sub(Rule):
             raise FieldError("is missing")
         return self.plan.read(getattr(message, name), contents)
 
-    def pieces(self, number: int, value: Any) -> list[bytes]:
+    def pieces(self, number: int, value: Any) -> list[bytes | memoryview]:
         inner = self.plan.pieces(value, self.plan.message())
         return [delimited(number, sum(map(len, inner))), *inner]
 
@@ -294,7 +297,7 @@ class Many(Rule):
         self._check_count(len(contents))
         return tuple(self.rule.collect(contents))
 
-    def pieces(self, number: int, value: Any) -> list[bytes]:
+    def pieces(self, number: int, value: Any) -> list[bytes | memoryview]:
         if not isinstance(value, tuple):
             raise FieldError(f"must be a tuple, not {type(value).__name__}")
         self._check_count(len(value))
@@ -398,6 +401,7 @@ class Plan:
         self._tail = tuple((name, numbers[name], rule) for name, rule in self._rules if name == bulk)
         self._test = test
         self.has_bulk = bulk is not None
+        self._leading: dict[type[Any], list[tuple[str, Plan]]] = {}
 
     @property
     def bulk_field(self) -> tuple[int, Rule]:
@@ -424,7 +428,26 @@ class Plan:
         self._check(record)
         return record
 
-    def pieces(self, record: Any, message: Message) -> list[bytes]:
+    def parts(self, record: Any, cls: type[Part]) -> list[Part]:
+        """Every value of a class within a record, in order of appearance."""
+        found: list[Part] = []
+        for name, plan in self._fields_leading_to(cls):
+            value = getattr(record, name)
+            for entry in value if isinstance(value, tuple) else (value,):
+                if isinstance(entry, cls):
+                    found.append(entry)
+                elif entry is not None:
+                    found += plan.parts(entry, cls)
+        return found
+
+    def _fields_leading_to(self, cls: type[Any]) -> list[tuple[str, Plan]]:
+        if cls not in self._leading:
+            inner = [(name, rule.rule if isinstance(rule, Many) else rule) for name, rule in self._rules]
+            subs = [(name, rule.plan) for name, rule in inner if isinstance(rule, Sub)]
+            self._leading[cls] = [(name, sub) for name, sub in subs if sub.record is cls or sub._fields_leading_to(cls)]
+        return self._leading[cls]
+
+    def pieces(self, record: Any, message: Message) -> list[bytes | memoryview]:
         """A record as bytes that are to be joined, by way of an empty message; equal records give equal bytes.
 
         Raises:
@@ -432,7 +455,7 @@ class Plan:
             google.protobuf.message.EncodeError: what no rule forbids, but protobuf does.
         """
         self._fill(message, record, self._head)
-        pieces = [message.SerializeToString(deterministic=True)]
+        pieces: list[bytes | memoryview] = [message.SerializeToString(deterministic=True)]
         for name, number, rule in self._tail:
             try:
                 pieces += rule.pieces(number, getattr(record, name))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 from zenoh import handlers
@@ -17,6 +17,7 @@ from zenoh import handlers
 from vggt_motion.bus import calls, codec
 from vggt_motion.bus.delivery import Calls
 from vggt_motion.bus.parcels import Parcels
+from vggt_motion.bus.wire import Payload, joined, parts_of
 from vggt_motion.errors import (
     BusUnavailableError,
     CodecError,
@@ -28,9 +29,10 @@ from vggt_motion.errors import (
 )
 
 _log = logging.getLogger(__name__)
-Handler = Callable[[str, bytes], bytes]
-BatchHandler = Callable[[Sequence[bytes]], Sequence[bytes | Exception]]
+Handler = Callable[[str, bytes], Payload]
+BatchHandler = Callable[[Sequence[bytes | memoryview]], Sequence[bytes | Exception]]
 REFUSAL_ENCODING = codec.encoding_of(calls.Refusal)
+BUNDLE_ENCODING = codec.encoding_of(calls.Bundle)
 _FIFO_CAPACITY = 8
 _MAX_PENDING = 1024
 _MAX_PENDING_BYTES = 512 * 2**20
@@ -39,13 +41,21 @@ _MAX_MESSAGE_CHARS = 1000
 _CLOSE_S = 1.0
 
 
-@dataclass(frozen=True)
-class _Request:
+class _Request(NamedTuple):
     """A query that was taken in."""
 
     query: zenoh.Query
     attachment: bytes | None
     size_bytes: int
+
+
+class _Taken(NamedTuple):
+    """A request with its payload at hand, or those of its bundle."""
+
+    request: _Request
+    key: str
+    payloads: Sequence[bytes | memoryview]
+    is_bundle: bool
 
 
 class Server:
@@ -64,6 +74,7 @@ class Server:
         *,
         threads: int,
         at_a_time: int | None,
+        after: Callable[[], None] | None = None,
     ) -> None:
         """Declare the queryable.
 
@@ -73,13 +84,15 @@ class Server:
             handler: of one request, or of a batch.
             parcels: how long payloads come and go within this machine.
             threads: so many may answer at the same time.
-            at_a_time: how many requests a batch may hold; None: ``handler`` takes one.
+            at_a_time: how many messages a batch may hold; None: ``handler`` takes one request.
+            after: called when a batch was answered.
         """
         self._handler: Any = handler
         self._parcels = parcels
         self._key = key
         self._max_answering = threads
         self._at_a_time = at_a_time
+        self._after = after
         self._lock = threading.Lock()
         self._waiting: deque[_Request] = deque()
         self._held_bytes = 0  # of requests that are not answered yet
@@ -158,45 +171,78 @@ class Server:
                     batch = self._next_batch()
 
     def _answer(self, batch: Sequence[_Request]) -> None:
-        requests: list[tuple[_Request, str, bytes]] = []
-        for request in batch:
-            query = request.query
-            key = str(query.key_expr)
-            if self.is_closed:
-                _refuse(query, RefusalCode.UNAVAILABLE, "stopping")
-            elif "*" in key:
-                _refuse(query, RefusalCode.INVALID, "a request names one key, without wildcards")
-            else:
-                payload = query.payload.to_bytes() if query.payload is not None else b""
-                try:
-                    requests.append((request, key, self._parcels.take(payload, request.attachment)))
-                except BusUnavailableError as error:
-                    _refuse(query, RefusalCode.UNAVAILABLE, str(error))
-        outcomes: Sequence[bytes | Exception]
+        taken = [one for one in map(self._taken, batch) if one is not None]
+        outcomes: Sequence[Payload | Exception]
         try:
             if self._at_a_time is None:
-                outcomes = [self._handler(key, payload) for _, key, payload in requests]
+                outcomes = [self._handler(one.key, payload) for one in taken for payload in one.payloads]
             else:
-                outcomes = self._handler([payload for _, _, payload in requests])
+                outcomes = self._handler([payload for one in taken for payload in one.payloads])
         except Exception as error:
-            outcomes = [error] * len(requests)
-        for (request, key, payload), outcome in zip(requests, outcomes, strict=True):
-            self._reply(request, key, outcome, len(payload))
+            outcomes = [error] * sum(len(one.payloads) for one in taken)
+        rest = iter(outcomes)
+        for one in taken:
+            self._reply(one, list(itertools.islice(rest, len(one.payloads))))
+        if self._after is not None:
+            self._after()
 
-    def _reply(self, request: _Request, key: str, outcome: bytes | Exception, request_bytes: int) -> None:
-        if isinstance(outcome, VggtMotionError):
-            _refuse(request.query, refusal_code(outcome), str(outcome))
-        elif isinstance(outcome, Exception):
-            extra = {"key": key, "bytes": request_bytes}
-            _log.error("a request ended in a defect of ours", extra=extra, exc_info=outcome)
-            _refuse(request.query, RefusalCode.INTERNAL, f"internal error: {type(outcome).__name__}")
+    def _taken(self, request: _Request) -> _Taken | None:
+        """The payloads of a request, with which it need not come itself; None: it was refused."""
+        query = request.query
+        key = str(query.key_expr)
+        if self.is_closed:
+            _refuse(query, RefusalCode.UNAVAILABLE, "stopping")
+        elif "*" in key:
+            _refuse(query, RefusalCode.INVALID, "a request names one key, without wildcards")
         else:
-            is_near = self._parcels.is_near(request.attachment)
-            parcel = self._parcels.leave_answer(outcome) if is_near else None
-            payload = outcome if parcel is None else b""
-            greeting = self._parcels.greeting if is_near else None
-            attachment = greeting if parcel is None else parcel.attachment
-            _send(request.query, lambda: request.query.reply(key, payload, attachment=attachment))
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            try:
+                payload = self._parcels.take(payload, request.attachment)
+            except BusUnavailableError as error:
+                _refuse(query, refusal_code(error), str(error))
+                return None
+            bundled = self._bundled(query, payload)
+            return _Taken(request, key, bundled or (payload,), is_bundle=bundled is not None)
+        return None
+
+    def _bundled(self, query: zenoh.Query, payload: bytes) -> Sequence[bytes | memoryview] | None:
+        """The requests of a bundle; None: it is a request, or nothing, and the handler shall say what is wrong."""
+        if self._at_a_time is None or str(query.encoding) != BUNDLE_ENCODING:
+            return None
+        try:
+            return [part for one in codec.decode(calls.Bundle, payload).requests for part in parts_of(one)]
+        except CodecError:
+            return None
+
+    def _reply(self, taken: _Taken, outcomes: Sequence[Payload | Exception]) -> None:
+        refusals = [
+            self._refusal(taken.key, outcome, len(payload)) if isinstance(outcome, Exception) else None
+            for outcome, payload in zip(outcomes, taken.payloads, strict=True)
+        ]
+        request = taken.request
+        if taken.is_bundle:
+            answers = tuple(
+                calls.BundledAnswer(b"" if isinstance(outcome, Exception) else joined(outcome), refusal)
+                for outcome, refusal in zip(outcomes, refusals, strict=True)
+            )
+            payload: Payload = codec.encode(calls.BundleReply(answers))
+        elif refusals[0] is not None:
+            _send_refusal(request.query, refusals[0])
+            return
+        else:
+            (payload,) = outcomes  # type: ignore[assignment]
+        is_near = self._parcels.is_near(request.attachment)
+        parcel = self._parcels.leave_answer(payload) if is_near else None
+        greeting = self._parcels.greeting if is_near else None
+        attachment = greeting if parcel is None else parcel.attachment
+        content = joined(payload) if parcel is None else b""
+        _send(request.query, lambda: request.query.reply(taken.key, content, attachment=attachment))
+
+    def _refusal(self, key: str, error: Exception, request_bytes: int) -> calls.Refusal:
+        if isinstance(error, VggtMotionError):
+            return _as_refusal(refusal_code(error), str(error))
+        _log.error("a request ended in a defect of ours", extra={"key": key, "bytes": request_bytes}, exc_info=error)
+        return _as_refusal(RefusalCode.INTERNAL, f"internal error: {type(error).__name__}")
 
 
 class SleepingServer(Server):
@@ -302,12 +348,21 @@ def error_of(refusal: calls.Refusal) -> VggtMotionError:
 
 
 def _attachment_of(query: zenoh.Query) -> bytes | None:
-    return None if query.attachment is None else query.attachment.to_bytes()
+    attachment = query.attachment
+    return None if attachment is None else attachment.to_bytes()
 
 
 def _refuse(query: zenoh.Query, code: RefusalCode, message: str) -> None:
+    _send_refusal(query, _as_refusal(code, message))
+
+
+def _as_refusal(code: RefusalCode, message: str) -> calls.Refusal:
     line = "".join(character if character.isprintable() else " " for character in " ".join(message.split()))
-    payload = codec.encode(calls.Refusal(code, line[:_MAX_MESSAGE_CHARS]))
+    return calls.Refusal(code, line[:_MAX_MESSAGE_CHARS])
+
+
+def _send_refusal(query: zenoh.Query, refusal: calls.Refusal) -> None:
+    payload = codec.encode(refusal)
     _send(query, lambda: query.reply_err(payload, encoding=REFUSAL_ENCODING))
 
 

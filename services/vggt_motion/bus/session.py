@@ -7,11 +7,12 @@ gossip find strangers, and a link lease of 10 s is too long to notice a frozen p
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeVar
 
 import zenoh
@@ -30,6 +31,7 @@ from vggt_motion.bus.pubsub import (
     Token,
 )
 from vggt_motion.bus.serving import (
+    BUNDLE_ENCODING,
     REFUSAL_ENCODING,
     BatchHandler,
     Handler,
@@ -38,8 +40,10 @@ from vggt_motion.bus.serving import (
     SleepingServer,
     error_of,
 )
+from vggt_motion.bus.wire import Payload, joined
 from vggt_motion.config import BusConfig
-from vggt_motion.errors import BusError, BusUnavailableError, CodecError, ConfigurationError
+from vggt_motion.errors import BusError, BusUnavailableError, CodecError, ConfigurationError, VggtMotionError
+from vggt_motion.gathering import Gathering
 
 __all__ = ["Bus", "Closable", "EndpointTakenError", "Sample", "open_bus", "zenoh_config"]
 
@@ -50,6 +54,11 @@ _CLOSE_S = 1.0
 _HANDLERS_S = 0.3
 _MESSAGES_ONLY_S = 30.0
 _NO_PARCELS = Parcels()
+_BUNDLED_BYTES = 2**20  # longer requests go alone: what each costs apart from its bytes is little then
+_MAX_BUNDLE_BYTES = 8 * 2**20
+_MAX_BUNDLED = 64
+_MIN_BUNDLE_BYTES = _MAX_BUNDLE_BYTES // _MAX_BUNDLED  # a single request, as each counts for so much at least
+_BUNDLES_UNDER_WAY = 2  # one travels while the other one is being answered
 Kept = TypeVar("Kept", bound=Closable)
 
 
@@ -140,8 +149,10 @@ class Bus:
         self._near_keys: set[str] = set()  # who answered there last takes parcels
         self._messages_until_s = 0.0  # after a parcel that came to nothing
         self._lock = threading.Lock()
-        self._requests: set[zenoh.CancellationToken] = set()
+        self._requests = zenoh.CancellationToken()  # of all: what is asked after it was cancelled ends at once
         self._closables: list[Closable] = []
+        self._bundle_bytes = _MAX_BUNDLE_BYTES  # of one message, as far as the link has shown that it carries it
+        self._gatherings: dict[str, Gathering[Payload, bytes | VggtMotionError]] = {}
         self._interrupted = threading.Event()
         self.is_closed = False
 
@@ -155,7 +166,7 @@ class Bus:
         """Whether requests have been ended by :meth:`interrupt` or :meth:`close`."""
         return self._interrupted.is_set()
 
-    def request(self, key: str, payload: bytes, *, timeout_s: float | None = None) -> bytes:
+    def request(self, key: str, payload: Payload, *, timeout_s: float | None = None, encoding: str = "") -> bytes:
         """An acknowledged call: send a query and wait for its one answer.
 
         Raises:
@@ -170,11 +181,13 @@ class Bus:
         parcels = self._parcels if time.monotonic() >= self._messages_until_s else _NO_PARCELS
         parcel = parcels.leave(payload) if key in self._near_keys else None
         is_by_parcel = parcel is not None
+        is_answered = False
         try:
             if parcel is None:
-                sample = self._ask(key, payload, parcels.greeting, timeout)
+                sample = self._ask(key, joined(payload), parcels.greeting, timeout, encoding)
             else:
-                sample = self._ask(key, b"", parcel.attachment, timeout)
+                sample = self._ask(key, b"", parcel.attachment, timeout, encoding)
+            is_answered = True
             attachment = None if sample.attachment is None else sample.attachment.to_bytes()
             if payload and self._parcels.is_near(attachment):
                 self._near_keys.add(key)
@@ -187,25 +200,93 @@ class Bus:
             raise
         finally:
             if parcel is not None:
-                parcel.remove()
+                parcels.take_back(parcel, is_read=is_answered)
 
-    def _ask(self, key: str, payload: bytes, attachment: bytes | None, timeout: float) -> zenoh.Sample:
-        """Send a query and wait for its one answer."""
-        token = zenoh.CancellationToken()
+    def request_among_others(self, key: str, payload: Payload) -> bytes:
+        """As :meth:`request`, of a key that is served by :meth:`serve_together`.
+
+        What comes while other requests to the key are under way travels with them in one message.
+        """
+        if len(payload) > _BUNDLED_BYTES:
+            return self.request(key, payload)
         with self._lock:
-            if self._interrupted.is_set():
-                raise BusUnavailableError(f"{key}: stopping")
-            self._requests.add(token)
+            gathering = self._gatherings.get(key)
+            if gathering is None:
+                carry_out = functools.partial(self._request_bundle, key)
+                gathering = self._gatherings[key] = Gathering(
+                    carry_out,
+                    lanes=_BUNDLES_UNDER_WAY,
+                    max_weight=lambda: self._bundle_bytes,
+                    weigh=_weight_in_bundle,
+                )
+        outcome = gathering(payload)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def request_all(self, key: str, payloads: Sequence[Payload]) -> list[bytes | VggtMotionError]:
+        """Several requests to a key that is served by :meth:`serve_together`, in order, in one message.
+
+        Returns:
+            For the first of them, at least one, the answer or why it was refused: the others are to be asked next.
+
+        Raises:
+            BusUnavailableError: nobody answered; may be repeated, and is then of fewer requests.
+        """
+        bundle: list[Payload] = []
+        weight = 0
+        for payload in payloads:
+            weight += _weight_in_bundle(payload)
+            if bundle and weight > self._bundle_bytes:
+                break
+            bundle.append(payload)
+        outcomes = self._request_bundle(key, bundle)
+        for index, outcome in enumerate(outcomes):
+            if isinstance(outcome, BusUnavailableError):
+                if index == 0:
+                    raise outcome
+                return outcomes[:index]
+        return outcomes
+
+    def _request_bundle(self, key: str, payloads: Sequence[Payload]) -> list[bytes | VggtMotionError]:
+        try:
+            outcomes = self._answers_to(key, payloads)
+        except BusUnavailableError:
+            # A slow link may carry a few of them in time where it does not carry all.
+            self._bundle_bytes = max(self._bundle_bytes // 2, _MIN_BUNDLE_BYTES)
+            raise
+        self._bundle_bytes = min(self._bundle_bytes * 2, _MAX_BUNDLE_BYTES)
+        return outcomes
+
+    def _answers_to(self, key: str, payloads: Sequence[Payload]) -> list[bytes | VggtMotionError]:
+        if len(payloads) == 1:
+            try:
+                return [self.request(key, payloads[0])]
+            except BusUnavailableError:
+                raise
+            except VggtMotionError as error:
+                return [error]
+        bundle = codec.encode_in_pieces(calls.Bundle(tuple(payloads)))
+        reply = codec.decode(calls.BundleReply, self.request(key, bundle, encoding=BUNDLE_ENCODING))
+        if len(reply.answers) != len(payloads):
+            raise CodecError(f"{key}: {len(reply.answers)} answers to {len(payloads)} requests")
+        return [answer.payload if answer.refusal is None else error_of(answer.refusal) for answer in reply.answers]
+
+    def _ask(self, key: str, payload: bytes, attachment: bytes | None, timeout: float, encoding: str) -> zenoh.Sample:
+        """Send a query and wait for its one answer."""
+        if self._interrupted.is_set():
+            raise BusUnavailableError(f"{key}: stopping")
         try:
             replies: Any = self._session.get(
                 key,
                 handlers.FifoChannel(2),
                 payload=payload,
+                encoding=encoding or None,
                 attachment=attachment,
                 timeout=timeout,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                cancellation_token=token,
+                cancellation_token=self._requests,
             )
             reply = replies.recv()
         except zenoh.ZError:
@@ -213,9 +294,6 @@ class Bus:
             if self._interrupted.is_set():
                 raise BusUnavailableError(f"{key}: stopping") from None
             raise BusUnavailableError(f"{key}: nobody answers") from None
-        finally:
-            with self._lock:
-                self._requests.discard(token)
         if reply.ok is not None:
             sample: zenoh.Sample = reply.ok
             return sample
@@ -237,13 +315,22 @@ class Bus:
         """
         return self._keep(SleepingServer(self._session, key, handler, self._parcels, threads=threads, at_a_time=None))
 
-    def serve_together(self, key: str, handler: BatchHandler, *, at_a_time: int, threads: int = 1) -> Closable:
-        """As :meth:`serve`, of up to ``at_a_time`` requests that came while others were being answered, and promptly.
+    def serve_together(
+        self,
+        key: str,
+        handler: BatchHandler,
+        *,
+        at_a_time: int,
+        threads: int = 1,
+        after: Callable[[], None] | None = None,
+    ) -> Closable:
+        """As :meth:`serve`, of up to ``at_a_time`` messages that came while others were being answered, and promptly.
 
-        ``handler(payloads)`` returns for each, in order, its answer or the exception that becomes its error reply.
+        ``handler(payloads)`` returns for each, in order, its answer or the exception that becomes its error reply;
+        ``after`` is called when they have been sent.
         """
         return self._keep(
-            PromptServer(self._session, key, handler, self._parcels, threads=threads, at_a_time=at_a_time)
+            PromptServer(self._session, key, handler, self._parcels, threads=threads, at_a_time=at_a_time, after=after)
         )
 
     def publisher(self, key: str, *, blocking: bool, history: int = 0, encoding: str = "") -> Publisher:
@@ -296,12 +383,9 @@ class Bus:
 
     def interrupt(self) -> None:
         """End all requests under way and refuse new ones, so that a process that was told to stop does not wait."""
-        with self._lock:
-            self._interrupted.set()
-            pending = list(self._requests)
-        for token in pending:
-            with contextlib.suppress(zenoh.ZError):
-                token.cancel()  # type: ignore[no-untyped-call]
+        self._interrupted.set()
+        with contextlib.suppress(zenoh.ZError):
+            self._requests.cancel()  # type: ignore[no-untyped-call]
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep between attempts; True as soon as requests are interrupted."""
@@ -350,6 +434,10 @@ class Bus:
             self._closables = [entry for entry in self._closables if not entry.is_closed]
             self._closables.append(closable)
         return closable
+
+
+def _weight_in_bundle(payload: Payload) -> int:
+    return max(len(payload), _MIN_BUNDLE_BYTES)
 
 
 def _reason(error: Exception) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Final, NamedTuple, TypeAlias
 
 VARINT: Final = 0
 FIXED64: Final = 1
@@ -11,6 +11,37 @@ DELIMITED: Final = 2
 FIXED32: Final = 5
 _FIXED_BYTES: Final = {FIXED64: 8, FIXED32: 4}
 _MAX_SHIFT = 70  # of a number of ten bytes
+
+
+class Pieces:
+    """Bytes in several places that belong one behind the other; joined only where they have to be."""
+
+    __slots__ = ("parts", "size_bytes")
+
+    def __init__(self, parts: Iterable[bytes | memoryview]) -> None:
+        self.parts = tuple(parts)
+        self.size_bytes = sum(map(len, self.parts))
+
+    def __len__(self) -> int:
+        return self.size_bytes
+
+    def joined(self) -> bytes:
+        """The bytes in one place."""
+        return b"".join(self.parts)
+
+
+Payload: TypeAlias = bytes | Pieces
+"""What is sent."""
+
+
+def parts_of(payload: bytes | memoryview | Pieces) -> tuple[bytes | memoryview, ...]:
+    """The pieces of what may be one."""
+    return payload.parts if isinstance(payload, Pieces) else (payload,)
+
+
+def joined(payload: Payload) -> bytes:
+    """The bytes of what may be in pieces."""
+    return payload.joined() if isinstance(payload, Pieces) else payload
 
 
 class MalformedError(ValueError):

@@ -88,6 +88,6 @@ def _check_blobs(request: calls.AppendRequest, record: Any, blobs: list[Blob]) -
         if sha256 not in known:
             raise InvalidRequestError(f"'{request.record_id}' brings a blob that it does not refer to: {sha256}")
         if sha256 in shapes:
-            depth, _ = codec.decode_depth(blob.data)
-            if depth.shape != shapes[sha256]:
-                raise CodecError(f"depth blob {sha256}: {depth.shape} in place of {shapes[sha256]} (height, width)")
+            shape = codec.check_depth(blob.data)
+            if shape != shapes[sha256]:
+                raise CodecError(f"depth blob {sha256}: {shape} in place of {shapes[sha256]} (height, width)")

@@ -104,6 +104,7 @@ class Ledger:
         input_streams: Collection[str] = (),
         packed_blob_bytes: int = PACKED_BLOB_BYTES,
         inline_bytes: int = INLINE_BYTES,
+        recent_bytes: int = 0,
         policy: JobPolicy | None = None,
         result_streams: Mapping[str, str],
         dead_event: Callable[[JobReport], NewRecord],
@@ -121,6 +122,7 @@ class Ledger:
             input_streams: see :class:`.log.Store`.
             packed_blob_bytes: see :class:`.log.Store`.
             inline_bytes: see :class:`.log.Store`.
+            recent_bytes: see :class:`.log.Store`.
             policy: see :class:`.jobs.JobQueue`.
             result_streams: see :class:`.jobs.JobQueue`.
             dead_event: see :class:`.jobs.JobQueue`.
@@ -156,6 +158,7 @@ class Ledger:
                 input_streams=input_streams,
                 packed_blob_bytes=packed_blob_bytes,
                 inline_bytes=inline_bytes,
+                recent_bytes=recent_bytes,
                 time_ns=time_ns,
             )
             self.jobs = JobQueue(

@@ -248,7 +248,10 @@ class JobQueue:
             return Done(DoneOutcome.COMMITTED, self._store.add(transaction, record, prepared).sequence)
 
         prepared = self._store.prepare(blobs, references, is_input=False)
-        return self._rows.write(change)
+        done = self._rows.write(change)
+        if done.outcome is DoneOutcome.COMMITTED:
+            self._store.remember(blobs)
+        return done
 
     def fail(self, job_id: str, lease_id: str, reason: str, traceback: str = "", *, is_permanent: bool = False) -> bool:
         """Give a job back after an error; until ``max_failures`` it is tried again, after a back-off that doubles.
@@ -386,19 +389,19 @@ class JobQueue:
         transaction.add_job(row)
         return True
 
-    def _has_open(self, kinds: Collection[str], models: Collection[str]) -> bool:
-        now_s = self._clock()
-        return self._rows.read(lambda reader: reader.next_open_job(kinds, models, now_s)) is not None
-
     def _next_wake_s(self, kinds: Collection[str], models: Collection[str]) -> float:
         now_s = self._clock()
         wake_s = self._rows.read(lambda reader: reader.next_wake_s(kinds, models, now_s))
         return float("inf") if wake_s is None else wake_s
 
     def _try_claim(self, kinds: Collection[str], models: Collection[str], worker: str, claim_id: str) -> Lease | None:
+        def look(reader: Reader) -> tuple[bool, bool]:
+            has_lease = bool(claim_id) and reader.find_claim(worker, claim_id) is not None
+            return has_lease, has_lease or reader.next_open_job(kinds, models, self._clock()) is not None
+
         # A look without a lock first: most polls find nothing, and a transaction costs an fsync.
-        has_lease = bool(claim_id) and self._rows.read(lambda reader: reader.find_claim(worker, claim_id)) is not None
-        if not has_lease and not (self._may_start() and self._has_open(kinds, models)):
+        has_lease, has_job = self._rows.read(look)
+        if not has_job or not (has_lease or self._may_start()):
             return None
 
         def change(transaction: Transaction) -> Lease | None:

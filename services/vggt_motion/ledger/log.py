@@ -7,15 +7,17 @@ the same identity under the same id is acknowledged again with the same sequence
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import re
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from vggt_motion.errors import DiskFullError, VggtMotionError
+from vggt_motion.ledger.recent import RecentBlobs
 from vggt_motion.ledger.store import (
     Blob,
     BlobEntry,
@@ -102,6 +104,39 @@ class _Needs(NamedTuple):
     large: list[Blob]
     keep_free_bytes: int
 
+    @property
+    def new_bytes(self) -> int:
+        """Length of what travels with the record."""
+        return sum(map(len, self.small.values())) + sum(len(blob.data) for blob in self.large)
+
+
+def _no_wait() -> None:
+    """All is durable."""
+
+
+class _Kept(NamedTuple):
+    """The blobs of several records that are about to be added."""
+
+    prepared: dict[int, Prepared | Exception]
+    wait: Callable[[], None]  # until all of them are durable: nothing that refers to them is committed before
+    waiting: frozenset[int]  # those that have something to wait for
+
+
+def _held_back(
+    outcomes: dict[int, Appended | Exception], indices: Iterable[int], wanted: Sequence[Append]
+) -> dict[int, Appended | Exception]:
+    """Outcomes, with those of records that may not overtake one of their stream for which the disk is too full."""
+    full: dict[str, Exception] = {}
+    held = dict(outcomes)
+    for index in indices:
+        stream = wanted[index].record.stream
+        if index not in held and stream in full:
+            held[index] = full[stream]
+        outcome = held.get(index)
+        if isinstance(outcome, DiskFullError):
+            full.setdefault(stream, outcome)
+    return held
+
 
 @dataclass(frozen=True)
 class Sizes:
@@ -125,6 +160,7 @@ class Store:
         input_streams: Collection[str] = (),
         packed_blob_bytes: int = PACKED_BLOB_BYTES,
         inline_bytes: int = INLINE_BYTES,
+        recent_bytes: int = 0,
         time_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Put the log's rules on top of rows and blobs.
@@ -137,6 +173,7 @@ class Store:
             input_streams: the streams that bring new input, and with it more work and more data.
             packed_blob_bytes: length up to which new blobs are packed, or kept among the rows.
             inline_bytes: length in all up to which those of them that come together are kept among the rows.
+            recent_bytes: so much of what came last is answered from memory.
             time_ns: wall clock, informative.
         """
         self._rows = rows
@@ -146,6 +183,7 @@ class Store:
         self._input_streams = frozenset(input_streams)
         self._packed_blob_bytes = packed_blob_bytes
         self._inline_bytes = inline_bytes
+        self._recent = RecentBlobs(recent_bytes)
         self._time_ns = time_ns
 
     def append(
@@ -175,25 +213,31 @@ class Store:
         Returns:
             For each, in order, its acknowledgement or what :meth:`append` would have raised.
         """
-        outcomes = self._appended_as_new(wanted)
-        if len(outcomes) < len(wanted):
-            rest = [index for index in range(len(wanted)) if index not in outcomes]
-            outcomes |= zip(rest, self._append_after_a_look([wanted[index] for index in rest]), strict=True)
+        free_bytes = self._blobs.free_bytes()
+        outcomes = self._appended_as_new(wanted, free_bytes) or self._append_after_a_look(wanted, free_bytes)
+        for index, outcome in outcomes.items():
+            if isinstance(outcome, Appended):
+                self.remember(wanted[index].blobs)
         return [outcomes[index] for index in range(len(wanted))]
 
-    def _appended_as_new(self, wanted: Sequence[Append]) -> dict[int, Appended | Exception]:
-        """Append those that need nothing but their rows if they are new: most do and are, and nothing is read twice."""
-        free_bytes = self._blobs.free_bytes()
+    def _appended_as_new(self, wanted: Sequence[Append], free_bytes: int) -> dict[int, Appended | Exception]:
+        """Append records that need nothing but their rows, if they are all new: most are, and nothing is read twice.
+
+        Returns:
+            Nothing where one is not, or something is in the way: then nothing was changed.
+        """
         size_bytes = sum(len(blob.data) if isinstance(blob, Blob) else len(blob) for e in wanted for blob in e.blobs)
         if size_bytes > self._inline_bytes or free_bytes < self.reserve_bytes + 2 * size_bytes:
             return {}
-        changes: dict[int, Callable[[Transaction], Appended]] = {}
-        for index, entry in enumerate(wanted):
+        changes: list[Callable[[Transaction], Appended]] = []
+        for entry in wanted:
             blobs = {blob.entry: blob.data for blob in map(Blob.of, entry.blobs)}
-            if len(blobs) <= MAX_BLOBS_PER_RECORD and set(entry.references) == set(blobs) and _is_valid(entry.record):
-                changes[index] = functools.partial(self._add_if_new, entry.record, blobs)
-        written = self._write_all(changes)
-        return {index: outcome for index, outcome in written.items() if not isinstance(outcome, _NotNewError)}
+            if len(blobs) > MAX_BLOBS_PER_RECORD or set(entry.references) != set(blobs) or not _is_valid(entry.record):
+                return {}
+            changes.append(functools.partial(self._add_if_new, entry.record, blobs))
+        with contextlib.suppress(VggtMotionError, _NotNewError):
+            return dict(enumerate(self._rows.write(lambda transaction: [change(transaction) for change in changes])))
+        return {}
 
     def _add_if_new(self, record: NewRecord, blobs: dict[BlobEntry, Content], transaction: Transaction) -> Appended:
         if self._find_known(transaction, record) is not None:
@@ -203,19 +247,37 @@ class Store:
                 raise _NotNewError
         return self._insert(transaction, record, Prepared(tuple(blobs), contents=tuple(blobs.items())))
 
-    def _write_all(self, changes: dict[int, Callable[[Transaction], Appended]]) -> dict[int, Appended | Exception]:
+    def _write_all(
+        self, changes: dict[int, Callable[[Transaction], Appended]], kept: _Kept, wanted: Sequence[Append]
+    ) -> dict[int, Appended | Exception]:
+        """Carry out changes in one commit, each for itself if they do not all go at once."""
+
+        def all_at_once(transaction: Transaction) -> list[Appended]:
+            appended = [change(transaction) for change in changes.values()]
+            kept.wait()
+            return appended
+
         if not changes:
             return {}
+        with contextlib.suppress(VggtMotionError):
+            return dict(zip(changes, self._rows.write(all_at_once), strict=True))
+        outcomes: dict[int, Appended | Exception] = {}
         try:
-            return dict(zip(changes, self._rows.write_all(list(changes.values())), strict=True))
+            kept.wait()
         except VggtMotionError as error:
-            return dict.fromkeys(changes, error)
+            outcomes |= {index: error for index in changes if index in kept.waiting}
+        outcomes = _held_back(outcomes, changes, wanted)
+        rest = {index: change for index, change in changes.items() if index not in outcomes}
+        try:
+            return outcomes | dict(zip(rest, self._rows.write_all(list(rest.values())), strict=True))
+        except VggtMotionError as error:
+            return outcomes | dict.fromkeys(rest, error)
 
-    def _append_after_a_look(self, wanted: Sequence[Append]) -> list[Appended | Exception]:
-        """:meth:`append_all` of those that may be known, or bring more than stands among the rows."""
+    def _append_after_a_look(self, wanted: Sequence[Append], free_bytes: int) -> dict[int, Appended | Exception]:
+        """:meth:`append_all` of records that may be known, or bring more than stands among the rows."""
         outcomes: dict[int, Appended | Exception] = {}
         needed: dict[int, _Needs] = {}
-        known = self._known(wanted)
+        known = self._known(wanted, is_accepting=free_bytes >= self.reserve_bytes)
         for index, entry in enumerate(wanted):
             row = known.get(index)
             try:
@@ -225,26 +287,30 @@ class Store:
                     outcomes[index] = Appended(row.sequence, was_known=True)
                     continue
                 is_input = entry.record.stream in self._input_streams
-                needed[index] = self._needs(entry.blobs, entry.references, is_input=is_input)
+                needed[index] = self._needs(entry.blobs, entry.references, free_bytes, is_input=is_input)
+                free_bytes -= needed[index].new_bytes
             except VggtMotionError as error:
                 outcomes[index] = error
+        outcomes = _held_back(outcomes, range(len(wanted)), wanted)
+        needed = {index: needs for index, needs in needed.items() if index not in outcomes}
         changes: dict[int, Callable[[Transaction], Appended]] = {}
-        for index, prepared in zip(needed, self._kept(list(needed.values())), strict=True):
+        kept = self._kept(needed)
+        for index, prepared in kept.prepared.items():
             if isinstance(prepared, Exception):
                 outcomes[index] = prepared
             else:
                 changes[index] = functools.partial(self.add, record=wanted[index].record, prepared=prepared)
-        outcomes |= self._write_all(changes)
-        return [outcomes[index] for index in range(len(wanted))]
+        outcomes = _held_back(outcomes, range(len(wanted)), wanted)
+        changes = {index: change for index, change in changes.items() if index not in outcomes}
+        return outcomes | self._write_all(changes, kept, wanted)
 
-    def _known(self, wanted: Sequence[Append]) -> dict[int, RecordRow | VggtMotionError]:
+    def _known(self, wanted: Sequence[Append], *, is_accepting: bool) -> dict[int, RecordRow | VggtMotionError]:
         """The rows of those that are there already, before blobs are written or space is asked for; or what is wrong.
 
         Those without blobs are not looked for while there is space: the commit does it.
         """
         found: dict[int, RecordRow | VggtMotionError] = {}
         asked: list[int] = []
-        is_accepting = self.is_accepting
         for index, entry in enumerate(wanted):
             try:
                 check_record(entry.record)
@@ -279,17 +345,20 @@ class Store:
             UnknownError: a reference to a blob that is neither here nor stored.
             DiskFullError: not enough space.
         """
-        (outcome,) = self._kept([self._needs(blobs, references, is_input=is_input)])
+        kept = self._kept({0: self._needs(blobs, references, self._blobs.free_bytes(), is_input=is_input)})
+        outcome = kept.prepared[0]
         if isinstance(outcome, Exception):
             raise outcome
+        kept.wait()
         return outcome
 
-    def _needs(self, blobs: Sequence[Content | Blob], references: Sequence[BlobEntry], *, is_input: bool) -> _Needs:
+    def _needs(
+        self, blobs: Sequence[Content | Blob], references: Sequence[BlobEntry], free_bytes: int, *, is_input: bool
+    ) -> _Needs:
         """What :meth:`prepare` has to do, after it was checked."""
         if len(blobs) > MAX_BLOBS_PER_RECORD or len(references) > MAX_BLOBS_PER_RECORD:
             raise InvalidRequestError(f"more than {MAX_BLOBS_PER_RECORD} blobs for one record")
         keep_free_bytes = self.reserve_bytes if is_input else self.reserve_bytes // 2
-        free_bytes = self._blobs.free_bytes()
         if free_bytes < keep_free_bytes:
             raise DiskFullError(reserve_line(free_bytes, keep_free_bytes))
         hashed = [Blob.of(data) for data in blobs]
@@ -312,50 +381,56 @@ class Store:
         entries = sorted({*(blob.entry for blob in hashed), *references}, key=lambda entry: entry.sha256)
         return _Needs(tuple(entries), small, large, keep_free_bytes)
 
-    def _kept(self, needed: Sequence[_Needs]) -> list[Prepared | Exception]:
-        """Make the blobs of several records durable: the small ones under one sync, of the others each for itself."""
-        outcomes: list[Prepared | Exception] = []
-        packed: dict[BlobEntry, Place] = {}
+    def _kept(self, needed: dict[int, _Needs]) -> _Kept:
+        """Make the blobs of several records durable: the small ones under one sync, of the others each for itself.
+
+        What lies in packs is durable only after it was waited for.
+        """
+        places: dict[BlobEntry, Place] = {}
         inline: dict[BlobEntry, Content] = {}
+        wait: Callable[[], None] = _no_wait
         failure: VggtMotionError | None = None
         try:
-            new = self._not_kept({entry: data for needs in needed for entry, data in needs.small.items()})
+            new = self._not_kept({entry: data for needs in needed.values() for entry, data in needs.small.items()})
             if sum(entry.size_bytes for entry in new) <= self._inline_bytes:
                 inline = new
             else:
-                packed = dict(zip(new, self._packs.append(list(new.values())), strict=True))
+                writing = self._packs.begin(list(new.values()))
+                places = dict(zip(new, writing.places, strict=True))
+                wait = writing.wait
         except VggtMotionError as error:
             failure = error
-        for needs in needed:
+        outcomes: dict[int, Prepared | Exception] = {}
+        for index, needs in needed.items():
             if needs.small and failure is not None:
-                outcomes.append(failure)
+                outcomes[index] = failure
                 continue
             try:
                 if needs.large:
                     self._blobs.put(needs.large, keep_free_bytes=needs.keep_free_bytes)
             except VggtMotionError as error:
-                outcomes.append(error)
+                outcomes[index] = error
                 continue
-            places = tuple((entry, packed[entry]) for entry in needs.small if entry in packed)
+            packed = tuple((entry, places[entry]) for entry in needs.small if entry in places)
             contents = tuple((entry, inline[entry]) for entry in needs.small if entry in inline)
-            outcomes.append(Prepared(needs.entries, places, contents))
-        return outcomes
+            outcomes[index] = Prepared(needs.entries, packed, contents)
+        waiting = frozenset(index for index, needs in needed.items() if any(entry in places for entry in needs.small))
+        return _Kept(outcomes, wait, waiting)
 
     def _not_kept(self, small: dict[BlobEntry, Content]) -> dict[BlobEntry, Content]:
         """Those that are not kept yet, or are damaged: then they come back so."""
         if not small:
             return small
-        places, contents = self._rows.read(
-            lambda reader: (
-                {entry: reader.find_place(entry.sha256) for entry in small},
-                {entry: reader.find_content(entry.sha256) for entry in small},
-            )
-        )
 
+        def look(reader: Reader) -> dict[BlobEntry, tuple[Place | None, bytes | None]]:
+            known = [entry for entry in small if reader.find_blob(entry.sha256) is not None]
+            return {entry: (reader.find_place(entry.sha256), reader.find_content(entry.sha256)) for entry in known}
+
+        found = self._rows.read(look)
         missing = {}
         for entry, data in small.items():
-            place = places[entry]
-            kept = contents[entry] if place is None else self._packs.read(place)
+            place, content = found.get(entry, (None, None))
+            kept = content if place is None else self._packs.read(place)
             if kept != data:
                 missing[entry] = data
                 if kept is not None:
@@ -370,6 +445,10 @@ class Store:
         # A content that was damaged comes back so.
         _tell_where(transaction, prepared)
         return Appended(known.sequence, was_known=True)
+
+    def remember(self, blobs: Sequence[Content | Blob]) -> None:
+        """Answer these from memory for a while: they are durable."""
+        self._recent.add(blob for blob in blobs if isinstance(blob, Blob))
 
     def _insert(self, transaction: Transaction, record: NewRecord, prepared: Prepared) -> Appended:
         _tell_where(transaction, prepared)
@@ -410,14 +489,19 @@ class Store:
         count = min(limit or MAX_READ_RECORDS, MAX_READ_RECORDS)
         return self._rows.read(lambda reader: list(bounded_records(reader, stream, from_sequence, count)))
 
-    def blob(self, sha256: str) -> bytes:
-        """The bytes of a blob, verified; damaged ones are set aside, and appending the record again heals them.
+    def blob(self, sha256: str) -> Content:
+        """The bytes of a blob, verified when they came or are read.
+
+        Damaged ones are set aside, and appending the record again heals them.
 
         Raises:
             InvalidRequestError: not a SHA-256.
             UnknownError: there is no such blob.
             DamagedBlobError: its bytes are not what they were.
         """
+        recent = self._recent.get(sha256)
+        if recent is not None:
+            return recent
         content, place = self._rows.read(lambda reader: (reader.find_content(sha256), reader.find_place(sha256)))
         if place is not None:
             content = self._packs.read(place)

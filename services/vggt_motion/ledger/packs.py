@@ -10,23 +10,26 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import logging
 import os
 import re
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
 from vggt_motion.direct import aligned_up, block_memory, open_direct, read_direct
 from vggt_motion.errors import DiskFullError, LedgerError
 from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, make_folder
-from vggt_motion.ledger.store import Content, Place
+from vggt_motion.ledger.store import Content, Place, Writing
 
 _LOGGER = logging.getLogger(__name__)
 _NAME = re.compile(r"(\d{8})\.pack")
 MAX_PACK_BYTES: Final = 2**30
 _STAGE_BYTES = 8 * 2**20
+_BACKGROUND_BYTES = 2**19  # less is on the disk before another thread would have begun
 
 
 class PackFiles:
@@ -49,7 +52,10 @@ class PackFiles:
         self._max_pack_bytes = max_pack_bytes
         self._files = files or FileOperations()
         self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        self._writing_count = 0
         self._open: dict[int, _Pack] = {}
+        self._background = ThreadPoolExecutor(1, thread_name_prefix="packs")
         self._is_closed = False
         try:
             make_folder(folder, self._files)
@@ -65,27 +71,70 @@ class PackFiles:
             DiskFullError: there is no space; nothing was kept.
             LedgerError: the disk failed.
         """
+        writing = self.begin(contents, in_background=False)
+        writing.wait()
+        return list(writing.places)
+
+    def begin(self, contents: Sequence[Content], *, in_background: bool = True) -> Writing:
+        """As :meth:`append`, to be waited for: until then long contents are on their way to the disk.
+
+        Raises:
+            LedgerError: see there.
+        """
         if not contents:
-            return []
-        try:
-            with self._lock:
-                pack = self._writable()
-                offset = pack.write(contents)
+            return Writing((), lambda: None)
+        size_bytes = sum(map(len, contents))
+        with self._translated(size_bytes), self._lock:
+            pack = self._writable()
+            begin = offset = pack.reserve(size_bytes)
+            make_durable = functools.partial(self._make_durable, pack, begin, contents)
+            wait: Callable[[], None]
+            if in_background and size_bytes >= _BACKGROUND_BYTES:
+                wait = self._background.submit(make_durable).result
+            else:
+                wait = _Once(make_durable)
+        places = []
+        for content in contents:
+            places.append(Place(pack.number, offset, len(content)))
+            offset += len(content)
+        return Writing(tuple(places), wait)
+
+    def _make_durable(self, pack: _Pack, begin: int, contents: Sequence[Content]) -> None:
+        with self._translated(sum(map(len, contents))), self._writing():
+            try:
+                pack.write(begin, contents)
+            except OSError:
+                with self._lock:
+                    pack.give_back(begin, contents)
+                raise
             try:
                 pack.sync()
             except OSError:
                 with self._lock:
                     self._number = max(self._number, pack.number + 1)
                 raise
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """While something is written the files stay open: a closed descriptor may be another file's at once."""
+        with self._lock:
+            self._refuse_if_closed()
+            self._writing_count += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._writing_count -= 1
+                self._changed.notify_all()
+
+    @contextlib.contextmanager
+    def _translated(self, size_bytes: int) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             if error.errno in NO_SPACE:
-                raise DiskFullError(f"no space for {sum(map(len, contents))} bytes in {self._folder}") from error
+                raise DiskFullError(f"no space for {size_bytes} bytes in {self._folder}") from error
             raise LedgerError(f"cannot write to {self._folder}: {error.strerror or error}") from error
-        places = []
-        for content in contents:
-            places.append(Place(pack.number, offset, len(content)))
-            offset += len(content)
-        return places
 
     def read(self, place: Place) -> bytes:
         """What lies at a place; shorter or empty where the pack is not what it was. Not verified."""
@@ -134,6 +183,9 @@ class PackFiles:
         """Close the files for good: the session may be somebody else's from now on."""
         with self._lock:
             self._is_closed = True
+            self._changed.wait_for(lambda: self._writing_count == 0)
+        self._background.shutdown()
+        with self._lock:
             for pack in self._open.values():
                 pack.close()
             self._open.clear()
@@ -146,11 +198,14 @@ class PackFiles:
         return pack
 
     def _pack(self, number: int, *, is_new: bool) -> _Pack:
-        if self._is_closed:
-            raise OSError(errno.EBADF, "the session is closed")
+        self._refuse_if_closed()
         if number not in self._open:
             self._open[number] = _Pack(self._path(number), number, self._files, may_create=is_new)
         return self._open[number]
+
+    def _refuse_if_closed(self) -> None:
+        if self._is_closed:
+            raise OSError(errno.EBADF, "the session is closed")
 
     def _has(self, number: int) -> bool:
         return self._path(number).is_file()
@@ -176,6 +231,27 @@ def _path(folder: Path, number: int) -> Path:
     return folder / f"{number:08d}.pack"
 
 
+class _Once:
+    """Work that is carried out by the first who waits for it; everybody gets what came of it. Thread-safe."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self._work = work
+        self._lock = threading.Lock()
+        self._is_done = False
+        self._error: Exception | None = None
+
+    def __call__(self) -> None:
+        with self._lock:
+            if not self._is_done:
+                self._is_done = True
+                try:
+                    self._work()
+                except Exception as error:
+                    self._error = error
+        if self._error is not None:
+            raise self._error
+
+
 class _Pack:
     """One open file."""
 
@@ -185,22 +261,52 @@ class _Pack:
         self._files = files
         self._descriptor = open_direct(path, os.O_RDWR | (os.O_CREAT if may_create else 0))
         self.end = aligned_up(os.fstat(self._descriptor).st_size)
+        self._given_back: dict[int, int] = {}  # rooms, by their ends: where they begin
         self._is_named = False  # also if it is there: a process that was killed may not have come to its name
         self._failure: OSError | None = None
         self._shared_sync = SharedSync(self._force)
 
-    def write(self, contents: Sequence[Content]) -> int:
-        """Put contents behind what is there, not durable yet; returns where they begin. One caller at a time."""
-        begin = self.end
+    def reserve(self, size_bytes: int) -> int:
+        """Room for contents behind all others; returns where it begins. One caller at a time, as :meth:`give_back`.
+
+        Raises:
+            OSError: nothing may be written any more.
+        """
         self._refuse_after_failure()
-        try:
-            self._write(contents)
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, begin)
-            self.end = begin
-            raise
+        begin = self.end
+        self.end += aligned_up(size_bytes)
         return begin
+
+    def give_back(self, begin: int, contents: Sequence[Content]) -> None:
+        """The room will not be used; where others wrote behind it, it stays, and nobody refers to it."""
+        self._given_back[begin + aligned_up(sum(map(len, contents)))] = begin
+        while self.end in self._given_back:
+            self.end = self._given_back.pop(self.end)
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, self.end)
+
+    def write(self, begin: int, contents: Sequence[Content]) -> None:
+        """Put contents where room was reserved for them, not durable yet.
+
+        Raises:
+            OSError: the disk is full, or fails.
+        """
+        offset = begin
+        with block_memory(min(sum(map(len, contents)), _STAGE_BYTES)) as stage:
+            filled = 0
+            for content in contents:
+                rest = memoryview(content)
+                while rest:
+                    count = min(len(rest), len(stage) - filled)
+                    stage[filled : filled + count] = rest[:count]
+                    filled, rest = filled + count, rest[count:]
+                    if filled == len(stage):
+                        self._files.write_blocks(self._path, self._descriptor, offset, stage)
+                        offset, filled = offset + filled, 0
+            if filled:
+                padded = aligned_up(filled)
+                stage[filled:padded] = bytes(padded - filled)
+                self._files.write_blocks(self._path, self._descriptor, offset, stage[:padded])
 
     def sync(self) -> None:
         """Return when all that was written before is durable."""
@@ -211,28 +317,6 @@ class _Pack:
 
     def close(self) -> None:
         os.close(self._descriptor)
-
-    def _write(self, contents: Sequence[Content]) -> None:
-        size_bytes = sum(map(len, contents))
-        with block_memory(min(size_bytes, _STAGE_BYTES)) as stage:
-            filled = 0
-            for content in contents:
-                rest = memoryview(content)
-                while rest:
-                    count = min(len(rest), len(stage) - filled)
-                    stage[filled : filled + count] = rest[:count]
-                    filled, rest = filled + count, rest[count:]
-                    if filled == len(stage):
-                        self._write_blocks(stage)
-                        filled = 0
-            if filled:
-                padded = aligned_up(filled)
-                stage[filled:padded] = bytes(padded - filled)
-                self._write_blocks(stage[:padded])
-
-    def _write_blocks(self, blocks: memoryview) -> None:
-        self._files.write_blocks(self._path, self._descriptor, self.end, blocks)
-        self.end += len(blocks)
 
     def _force(self) -> None:
         self._refuse_after_failure()

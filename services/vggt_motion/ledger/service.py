@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Final
 
 from vggt_motion.bus import calls, codec
+from vggt_motion.bus.follow import SEVERAL_ENTRIES
 from vggt_motion.bus.jobs import many_lines, one_line
 from vggt_motion.bus.keys import last_chunk, service_of
 from vggt_motion.bus.service import ServiceContext, run_service
+from vggt_motion.bus.serving import Handler
 from vggt_motion.bus.session import Bus, Closable
+from vggt_motion.bus.wire import Payload, Pieces
 from vggt_motion.config import Config, LedgerConfig
 from vggt_motion.errors import (
     BusError,
@@ -30,7 +33,7 @@ from vggt_motion.ledger.admission import admitted, known_stream
 from vggt_motion.ledger.directory import Ledger
 from vggt_motion.ledger.jobs import JobPolicy
 from vggt_motion.ledger.log import Append
-from vggt_motion.ledger.store import NewRecord, RecordRow, reserve_line
+from vggt_motion.ledger.store import Content, NewRecord, RecordRow, reserve_line
 from vggt_motion.records import (
     Event,
     EventKind,
@@ -58,6 +61,8 @@ _TICKS_PER_LEASE = 8
 _HEALTH_S = 1.0
 _SIZES_S = 5.0  # the sum over all blobs is not asked for more often
 _HISTORY = 16
+_PUBLISHED_TOGETHER = 32
+_PUBLISHED_BYTES = 32 * 2**10
 _GATHER_S = 0.01  # acknowledgements go out first, and what comes together is read from the log together
 _FEW_WAITERS = 32
 _CROWDED_WAIT_S = 1.0
@@ -67,7 +72,7 @@ _MAX_VANISHED = 4096
 _JOIN_S = 1.0
 
 # Long polls have threads of their own, so that they never hold up an append.
-_APPEND_THREADS = 2  # one prepares while the other waits for the disk
+_APPEND_THREADS = 1  # what comes meanwhile goes together; two would alternate at every statement, and take longer
 _APPENDS_AT_A_TIME = 64  # what comes meanwhile shares one fsync
 _DONE_THREADS = 8
 _READ_THREADS = 4
@@ -117,6 +122,7 @@ def open_session(directory: Path, config: LedgerConfig) -> Ledger:
     return Ledger(
         directory,
         reserve_bytes=config.reserve_bytes,
+        recent_bytes=config.recent_bytes,
         input_streams=INPUT_STREAMS,
         policy=JobPolicy(
             lease_duration_s=config.lease_duration_s,
@@ -283,15 +289,35 @@ class LogPublisher:
     def _publish(self) -> None:
         for stream, end in self._store.positions().items():
             while self._cursors[stream] < end:
-                for row in self._store.read(stream, self._cursors[stream]):
-                    self._cursors[stream] = row.sequence + 1
-                    try:
-                        self._publishers[stream].put(codec.encode(_entry(row)))
-                    except BusUnavailableError:
-                        raise
-                    except BusError as error:
-                        extra = {"stream": stream, "sequence": row.sequence, "reason": str(error)}
-                        _log.error("a record cannot be published", extra=extra)
+                rows = self._store.read(stream, self._cursors[stream])
+                while rows:
+                    count = _published_together(rows)
+                    self._put(stream, [_entry(row) for row in rows[:count]])
+                    self._cursors[stream] = rows[count - 1].sequence + 1
+                    rows = rows[count:]
+
+    def _put(self, stream: str, entries: Sequence[LogEntry]) -> None:
+        try:
+            if len(entries) == 1:
+                self._publishers[stream].put(codec.encode(entries[0]))
+            else:
+                together = calls.ReadReply(tuple(entries), entries[-1].sequence + 1)
+                self._publishers[stream].put(codec.encode(together), encoding=SEVERAL_ENTRIES)
+        except BusUnavailableError:
+            raise
+        except BusError as error:
+            extra = {"stream": stream, "sequence": entries[0].sequence, "reason": str(error)}
+            _log.error("records cannot be published", extra=extra)
+
+
+def _published_together(rows: Sequence[RecordRow]) -> int:
+    """How many of the first rows go in one message, so that it stays small."""
+    size_bytes = 0
+    for count, row in enumerate(rows):
+        size_bytes += len(row.payload)
+        if count and (size_bytes > _PUBLISHED_BYTES or count == _PUBLISHED_TOGETHER):
+            return count
+    return len(rows)
 
 
 class Desk:
@@ -311,7 +337,7 @@ class Desk:
 
     def serve(self, bus: Bus, presence: Presence) -> Iterator[Closable]:
         """Declare every key."""
-        handlers: list[tuple[str, int, Callable[[str, bytes], bytes]]] = [
+        handlers: list[tuple[str, int, Handler]] = [
             (bus.keys.rpc("ledger", "read"), _READ_THREADS, lambda _, payload: self.read(payload)),
             (bus.keys.rpc("ledger", "blobs"), _READ_THREADS, lambda _, payload: self.blobs(payload)),
             (bus.keys.rpc("ledger", "status"), _FEW_THREADS, lambda _, payload: self.answer_status(payload)),
@@ -325,7 +351,11 @@ class Desk:
             (bus.keys.rpc("jobs", "cancel"), _FEW_THREADS, lambda _, payload: self.cancel(payload)),
         ]
         yield bus.serve_together(
-            bus.keys.rpc("ledger", "append"), self.append, at_a_time=_APPENDS_AT_A_TIME, threads=_APPEND_THREADS
+            bus.keys.rpc("ledger", "append"),
+            self.append,
+            at_a_time=_APPENDS_AT_A_TIME,
+            threads=_APPEND_THREADS,
+            after=self._wake_publisher,
         )
         for key, threads, handler in handlers:
             yield bus.serve(key, self.guarded(handler), threads=threads)
@@ -334,12 +364,11 @@ class Desk:
         """From now on, a call that fails because the session is closed may be repeated elsewhere."""
         self._is_closed = True
 
-    def append(self, payloads: Sequence[bytes]) -> list[bytes | Exception]:
+    def append(self, payloads: Sequence[bytes | memoryview]) -> list[bytes | Exception]:
         """``@rpc/ledger/append``, several at a time: each for itself, under one fsync."""
         wanted = [_admitted_or_why_not(payload) for payload in payloads]
         appended = iter(self._ledger.store.append_all([entry for entry in wanted if isinstance(entry, Append)]))
         outcomes = [next(appended) if isinstance(entry, Append) else entry for entry in wanted]
-        self._wake_publisher()
         return [
             self._answerable("append", outcome)
             if isinstance(outcome, Exception)
@@ -358,20 +387,20 @@ class Desk:
             end = max(end, entries[-1].sequence + 1)
         return codec.encode(calls.ReadReply(entries, end))
 
-    def blob(self, sha256: str) -> bytes:
+    def blob(self, sha256: str) -> Payload:
         """``@rpc/ledger/blob/{sha256}``."""
-        return self._ledger.store.blob(sha256)
+        return Pieces((self._ledger.store.blob(sha256),))
 
-    def blobs(self, payload: bytes) -> bytes:
+    def blobs(self, payload: bytes) -> Payload:
         """``@rpc/ledger/blobs``."""
-        contents: list[bytes] = []
+        contents: list[Content] = []
         size_bytes = 0
         for sha256 in codec.decode(calls.BlobsRequest, payload).sha256:
             contents.append(self._ledger.store.blob(sha256))
             size_bytes += len(contents[-1])
             if size_bytes >= _BLOBS_REPLY_BYTES:
                 break
-        return codec.encode(calls.BlobsReply(tuple(contents)))
+        return codec.encode_in_pieces(calls.BlobsReply(tuple(contents)))
 
     def answer_status(self, payload: bytes) -> bytes:
         """``@rpc/ledger/status``."""
@@ -462,10 +491,10 @@ class Desk:
                 self._sizes_until_s = time.monotonic() + _SIZES_S
             return self._stored_bytes
 
-    def guarded(self, handler: Callable[[str, bytes], bytes]) -> Callable[[str, bytes], bytes]:
+    def guarded(self, handler: Handler) -> Handler:
         """A handler whose refusals are counted, and whose store may fail."""
 
-        def guarded(key: str, payload: bytes) -> bytes:
+        def guarded(key: str, payload: bytes) -> Payload:
             try:
                 return handler(key, payload)
             except Exception as error:
@@ -493,7 +522,7 @@ class Desk:
         _log.warning("a request was refused", extra={"key": key, "reason": one_line(str(error))})
 
 
-def _admitted_or_why_not(payload: bytes) -> Append | Exception:
+def _admitted_or_why_not(payload: bytes | memoryview) -> Append | Exception:
     try:
         return admitted(codec.decode(calls.AppendRequest, payload))
     except Exception as error:

@@ -162,16 +162,22 @@ class _Statements:
         )
 
     def set_place(self, entry: BlobEntry, place: Place) -> None:
-        self._run("DELETE FROM contents WHERE sha256 = ?", entry.sha256)
-        self._run(
+        added = self._run(
             """INSERT INTO blobs (sha256, size_bytes, pack, offset_bytes) VALUES (?, ?, ?, ?)
-            ON CONFLICT (sha256)
-            DO UPDATE SET is_file = 1, pack = excluded.pack, offset_bytes = excluded.offset_bytes""",
+            ON CONFLICT (sha256) DO NOTHING""",
             entry.sha256,
             entry.size_bytes,
             place.pack,
             place.offset_bytes,
         )
+        if added == 0:
+            self._run("DELETE FROM contents WHERE sha256 = ?", entry.sha256)
+            self._run(
+                "UPDATE blobs SET is_file = 1, pack = ?, offset_bytes = ? WHERE sha256 = ?",
+                place.pack,
+                place.offset_bytes,
+                entry.sha256,
+            )
 
     def set_content(self, entry: BlobEntry, content: Content) -> None:
         self._run(
@@ -230,8 +236,9 @@ class _Statements:
         values = dataclasses.astuple(row)
         self._run(f"INSERT INTO leases ({_LEASE_COLUMNS}) VALUES ({_marks(values)})", *values)
 
-    def _run(self, statement: str, *values: Any) -> None:
-        self._connection.execute(statement, values)
+    def _run(self, statement: str, *values: Any) -> int:
+        """Carry out a statement; returns the number of rows that it changed."""
+        return self._connection.execute(statement, values).rowcount
 
     def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
         return self._connection.execute(statement, values).fetchall()
@@ -333,10 +340,9 @@ class SqliteRows:
 
     def close(self) -> None:
         """Finish the present commit, fold the write-ahead log into the database and close it."""
-        self._commits.wait_until_idle()
         if self._failure is None:
-            self._failure = f"{self._path} is closed"
-        self._commits.wait_until_idle()  # one that came between
+            self._failure = f"{self._path} is closed"  # for those that come from now on
+        self._commits.wait_until_idle()
         for _ in range(_MAX_READERS):
             connection = self._readers.get()
             if connection is not None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias, TypeVar
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 from vggt_motion.errors import RefusalCode, RequestRefusedError
 from vggt_motion.records import JobState
@@ -313,6 +313,13 @@ class Blobs(Protocol):
         """Keep a content that is not what it was where a person can look at it."""
 
 
+class Writing(NamedTuple):
+    """Contents on their way to the disk."""
+
+    places: tuple[Place, ...]  # to which nothing that lasts may refer before they have been waited for
+    wait: Callable[[], None]  # until they are durable; raises what :meth:`Packs.append` does, each time it is called
+
+
 class Packs(Protocol):
     """Durable bytes at places that the rows know: those that are too small for a file and too much for the rows."""
 
@@ -322,6 +329,9 @@ class Packs(Protocol):
         Raises:
             DiskFullError: there is no space; nothing was kept.
         """
+
+    def begin(self, contents: Sequence[Content]) -> Writing:
+        """As :meth:`append`, to be waited for."""
 
     def read(self, place: Place) -> bytes:
         """What lies at a place; not verified."""

@@ -25,6 +25,7 @@ from vggt_motion.bus import calls, codec
 from vggt_motion.bus.images import ImageHeader, decode_image, encode_image
 from vggt_motion.bus.ledger import append_request
 from vggt_motion.bus.parcels import _identity
+from vggt_motion.bus.serving import BUNDLE_ENCODING
 from vggt_motion.bus.session import Bus
 from vggt_motion.errors import CodecError, RequestRefusedError
 from vggt_motion.ledger.admission import admitted
@@ -69,10 +70,21 @@ def _done_entry(payload: bytes) -> None:
     admitted(codec.decode(calls.DoneRequest, payload).result)
 
 
+def _bundle_entry(payload: bytes) -> None:
+    for request in codec.decode(calls.Bundle, payload).requests:
+        assert isinstance(request, (bytes, memoryview))
+        with contextlib.suppress(CodecError, RequestRefusedError):  # each for itself
+            _append_entry(bytes(request))
+
+
 ENTRIES: dict[str, tuple[Callable[[bytes], Any], list[bytes]]] = {
     "append": (_append_entry, [codec.encode(request) for request in APPENDS]),
     "done": (_done_entry, [codec.encode(calls.DoneRequest("job", "lease", request)) for request in RESULTS]),
     "long append": (_long_append_entry, [codec.encode(request) for request in APPENDS]),
+    "bundle": (
+        _bundle_entry,
+        [codec.encode(calls.Bundle(tuple(map(codec.encode, APPENDS[at:])))) for at in (0, 3, -1)],
+    ),
     "parcel": (
         lambda payload: codec.decode(calls.Parcel, payload),
         [codec.encode(calls.Parcel("0123456789abcdef" * 2, "0123456789abcdef-7", 100_000))],
@@ -206,6 +218,15 @@ def test_hostile_bytes_through_a_live_session(tmp_path: Path, sample_dir: Path, 
                 assert "\n" not in str(caught.value)
                 refused += 1
         assert refused >= 3 * LIVE_CASES
+        for payload in _cases("bundle", generator):
+            with pytest.raises(RequestRefusedError):
+                session.bus.request(keys.rpc("ledger", "append"), payload, encoding=BUNDLE_ENCODING)
+            refused += 1
+        bundle = codec.encode(calls.Bundle(tuple(wrong)))
+        reply = session.bus.request(keys.rpc("ledger", "append"), bundle, encoding=BUNDLE_ENCODING)
+        answers = codec.decode(calls.BundleReply, reply).answers
+        assert len(answers) == len(wrong) and all(answer.refusal is not None for answer in answers)
+        refused += len(wrong)
         with _foreign_parcels(session.bus, tmp_path) as foreign:
             for attachment in (*_cases("parcel", generator), *foreign):
                 asked: Any = session.bus._session.get(

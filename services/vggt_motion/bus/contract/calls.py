@@ -18,6 +18,7 @@ from vggt_motion.bus.contract.values import (
     MAX_BLOBS_PER_REQUEST,
     MAX_CALL_BYTES,
     MAX_RECORD_BYTES,
+    MAX_REQUESTS_PER_BUNDLE,
     MAX_TASK_BYTES,
     NAME,
     REVISION,
@@ -39,7 +40,7 @@ from vggt_motion.records import (
     LogEntry,
     StreamPosition,
 )
-from vggt_motion.v1 import jobs_pb2, ledger_pb2, parcel_pb2
+from vggt_motion.v1 import bundle_pb2, jobs_pb2, ledger_pb2, parcel_pb2
 
 _PAYLOAD_TYPE = Text(128, 1, re.compile(r"[A-Za-z_][A-Za-z0-9_.]*"), "the full name of a message")
 _JOB_KIND = Choice(JobKind, jobs_pb2.JobKind)
@@ -122,6 +123,17 @@ _APPEND_REQUEST = plan(
     max_bytes=MAX_CALL_BYTES,
 )
 
+_REFUSAL = plan(
+    calls.Refusal,
+    ledger_pb2.Refusal,
+    rules={"code": Choice(RefusalCode, ledger_pb2.RefusalCode), "message": LINE},
+)
+_BUNDLED_ANSWER = plan(
+    calls.BundledAnswer,
+    bundle_pb2.BundledAnswer,
+    rules={"payload": Raw(MAX_RECORD_BYTES), "refusal": Sub(_REFUSAL, optional=True)},
+)
+
 CALL_PLANS: Final[tuple[Plan, ...]] = (
     _JOB,
     _LEASE,
@@ -129,10 +141,19 @@ CALL_PLANS: Final[tuple[Plan, ...]] = (
     _LOG_ENTRY,
     _LEDGER_STATUS,
     _APPEND_REQUEST,
+    _REFUSAL,
     plan(
-        calls.Refusal,
-        ledger_pb2.Refusal,
-        rules={"code": Choice(RefusalCode, ledger_pb2.RefusalCode), "message": LINE},
+        calls.Bundle,
+        bundle_pb2.Bundle,
+        rules={"requests": Many(Raw(MAX_CALL_BYTES), MAX_REQUESTS_PER_BUNDLE, 1)},
+        bulk="requests",
+        max_bytes=MAX_CALL_BYTES,
+    ),
+    plan(
+        calls.BundleReply,
+        bundle_pb2.BundleReply,
+        rules={"answers": Many(Sub(_BUNDLED_ANSWER), MAX_REQUESTS_PER_BUNDLE)},
+        max_bytes=MAX_CALL_BYTES,
     ),
     plan(
         calls.Parcel,

@@ -11,6 +11,7 @@ from vggt_motion.bus.schema import Many, Plan, Raw, Real, Rule, Text, Whole
 
 MAX_BLOB_BYTES: Final = 128 * 2**20
 MAX_BLOBS_PER_REQUEST: Final = 512
+MAX_REQUESTS_PER_BUNDLE: Final = 256
 MAX_RECORD_BYTES: Final = 32 * 2**20
 MAX_TASK_BYTES: Final = 2**22
 MAX_CALL_BYTES: Final = 512 * 2**20  # with all blobs; Zenoh drops messages above 1 GiB without a word
