@@ -9,11 +9,11 @@ an append: one hop to a process that writes, forces to the disk and hashes befor
 The folder must be on a real disk: in memory an fsync costs nothing. A round measures everything for a moment, and the
 rounds are repeated, so that a disk that has a bad minute has it for all.
 
-Then one ``vggt-motion run`` of a source, whose processes are watched. Numerics are the computing children, the pixels
-in the frontend (what the pure pipeline needs for the same frames in this process), the trajectories and maps in the
-recording (what the pure functions need for the same graphs in this process, payloads at hand) and the results that
-``run`` writes after the final graph; everything else after start-up is fabric. Start-up ends with the frontend's first
-record: until then the others import, open their files and start their children.
+Then one ``vggt-motion run`` of a source, whose processes are watched. Numerics are the computing children, the frames
+and pixels in the frontend, the trajectories and maps in the recording (of both the processor time of the threads in the
+pure functions, which the services count in place), and the results that ``run`` writes after the final graph;
+everything else after start-up is fabric. Start-up ends with the frontend's first record: until then the others import,
+open their files and start their children.
 """
 
 from __future__ import annotations
@@ -33,37 +33,29 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import TypeVar
 
-import cv2
 import psutil
 import zenoh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench_bus import answer
 
-from bus_processes import bus_config, running, wait_until
+from bus_processes import bus_config, free_port, running, wait_until
 from ledger_processes import Site, depth_blob, event, keyframe, predict, site, submap
 from vggt_motion.bus import codec
 from vggt_motion.bus.follow import Follower
 from vggt_motion.bus.ledger import append_request
 from vggt_motion.bus.service import ServiceContext, run_service
-from vggt_motion.bus.session import zenoh_config
-from vggt_motion.config import Config, LedgerConfig
+from vggt_motion.bus.session import Sample, open_bus, zenoh_config
+from vggt_motion.config import BusConfig, Config, LedgerConfig
 from vggt_motion.errors import LedgerError
-from vggt_motion.export import StoredSession
-from vggt_motion.frontend.pipeline import FrontendPipeline
 from vggt_motion.ledger.admission import admitted
 from vggt_motion.ledger.service import open_session
 from vggt_motion.ledger.sqlite import read_only
-from vggt_motion.recorder.container import McapScanner
-from vggt_motion.recorder.record import MAP_TOPIC, TRAJECTORY_TOPIC
-from vggt_motion.recorder.views import drawn_map, drawn_trajectory
-from vggt_motion.records import Event, GraphUpdate, JobKind, Keyframe, Stream, SubmapSpec, segment_index_of
-from vggt_motion.sources.registry import open_source
+from vggt_motion.records import Event, HealthReport, JobKind, Keyframe, SubmapSpec
 
 SIZES_BYTES = (100, 100_000, 5_000_000)
 IN_FLIGHT = 64
@@ -348,43 +340,6 @@ class Watched:
         return f"{self._names.get(process.ppid(), 'run')} compute"
 
 
-def pixel_seconds(source: str) -> float:
-    """CPU seconds of the pure frontend for every frame of a source."""
-    cv2.setNumThreads(1)
-    pipeline = FrontendPipeline(Config().frontend, "front")
-    opened = open_source(source)
-    begin = time.process_time()
-    for frame in opened.frames():
-        pipeline.push(frame)
-    pipeline.finish()
-    return time.process_time() - begin
-
-
-def view_seconds(out: Path) -> float:
-    """CPU seconds of the pure functions that make the trajectories and maps of a recording, payloads at hand."""
-    cv2.setNumThreads(1)
-    config = Config().backend
-    session = StoredSession(out / "ledger")
-    log = session.state
-    with read_only(out / "ledger" / "ledger.db") as reader:
-        graphs = [codec.decode(GraphUpdate, row.payload) for row in reader.records(Stream.GRAPH.value, 0, 10**6)]
-    of_revision = {graph.revision: graph for graph in graphs}  # of two of one number, the final one came last
-    drawn = [(message.channel.topic, message.sequence) for message in McapScanner(out / "run.mcap").messages()]
-    payloads = {frame.depth: b"" for geometry in log.submaps.values() for frame in geometry.frames}
-    payloads |= {keyframe.image: b"" for keyframe in log.keyframes.values()}
-    payloads = {ref: session.load_blob(ref) for ref in payloads}
-    begin = time.process_time()
-    for revision in sorted({revision for topic, revision in drawn if topic in (MAP_TOPIC, TRAJECTORY_TOPIC)}):
-        graph = of_revision[revision]
-        newest = max(segment_index_of(pose.submap_index) for pose in graph.poses)
-        segments = {index: segment for index, segment in log.segments.items() if index <= newest}
-        then = replace(log, segments=segments)
-        trajectory = drawn_trajectory(then, graph, config)
-        if (MAP_TOPIC, revision) in drawn:
-            drawn_map(then, graph, trajectory, config, payloads.__getitem__)
-    return time.process_time() - begin
-
-
 def has_record(database: Path, stream: str, record_id: str) -> bool:
     """Whether the log holds a record; read from its file, so that the ledger has no work with it."""
     with contextlib.suppress(LedgerError), read_only(database) as reader:
@@ -392,12 +347,31 @@ def has_record(database: Path, stream: str, record_id: str) -> bool:
     return False
 
 
+class NumericsWatch:
+    """What the services of a run say of the processor seconds that their own threads spent on numerics."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.cpu_s: dict[str, float] = {}
+        self._bus = open_bus(BusConfig(endpoint=endpoint, connect_timeout_s=60.0))
+        self._bus.subscribe(self._bus.keys.all_health(), self._on_health, is_small=True)
+
+    def _on_health(self, sample: Sample) -> None:
+        report = codec.decode(HealthReport, sample.payload)
+        self.cpu_s[report.service] = report.counters.get("numerics_cpu_s", 0.0)
+
+    def close(self) -> None:
+        self._bus.close()
+
+
 def measure_share(folder: Path, source: str) -> dict[str, float]:
     """CPU seconds of one run."""
     out = folder / "run"
-    command = [sys.executable, "-m", "vggt_motion", "run", source, "--out", str(out), "--set", "gateway.port=0"]
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "vggt_motion", "run", source, "--out", str(out)]
+    command += ["--set", "gateway.port=0", "--set", f"bus.endpoint={endpoint}"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     watched = Watched(psutil.Process(process.pid))
+    in_place = NumericsWatch(endpoint)
     start_up: dict[str, float] = {}
     run_until_graph = 0.0
     is_sending = is_solved = False
@@ -411,14 +385,14 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
             is_solved = has_record(out / "ledger" / "ledger.db", "graph", "graph/final")
             run_until_graph = now["run"]
         time.sleep(0.1)
+    in_place.close()
     assert process.returncode in (0, 3), f"the run ended with {process.returncode}"
     used = {name: seconds - start_up.get(name, 0.0) for name, seconds in watched.by_name().items()}
     numerics = {name: seconds for name, seconds in used.items() if name.endswith(" compute")}
-    numerics["frontend"] = min(pixel_seconds(source), used["frontend"])
-    numerics["recorder"] = min(view_seconds(out), used["recorder"])
+    numerics |= {name: seconds for name, seconds in in_place.cpu_s.items() if seconds > 0.0}
     numerics["run"] = max(0.0, used["run"] - (run_until_graph - start_up.get("run", 0.0)))
-    row = {f"{name}_fabric_s": round(used[name] - numerics.get(name, 0.0), 3) for name in used if name not in numerics}
-    row |= {f"{name}_fabric_s": used[name] - numerics[name] for name in ("frontend", "recorder", "run")}
+    services = [name for name in used if not name.endswith(" compute")]
+    row = {f"{name}_fabric_s": used[name] - numerics.get(name, 0.0) for name in services}
     fabric, everything = sum(row.values()), sum(used.values())
     row |= {f"{name.replace(' ', '_')}_numerics_s": seconds for name, seconds in numerics.items()}
     return row | {"fabric_s": fabric, "all_s": everything, "fabric_share_percent": 100.0 * fabric / everything}

@@ -391,7 +391,8 @@ class _ViewThread:
         if graph is None:
             return
         backend = self._context.config.backend
-        trajectory = drawn_trajectory(log, graph, backend)
+        with self._context.numerics:
+            trajectory = drawn_trajectory(log, graph, backend)
         self._writer.add_trajectory(trajectory)
         if self._writer.wants_map(trajectory):
             frame_ids = {
@@ -399,10 +400,16 @@ class _ViewThread:
                 for keyframe in log.keyframes.values()
             }
             read_blob = functools.partial(self._read_blob, frame_ids)
-            self._writer.add_map(drawn_map(log, graph, trajectory, backend, read_blob), trajectory)
+            with self._context.numerics:
+                points = drawn_map(log, graph, trajectory, backend, read_blob)
+            self._writer.add_map(points, trajectory)
 
     def _read_blob(self, frame_ids: Mapping[str, FrameId], ref: BlobRef) -> bytes:
         """A payload; ``frame_ids`` says which frame an image is, by its SHA-256."""
+        with self._context.numerics.paused():
+            return self._payload(frame_ids, ref)
+
+    def _payload(self, frame_ids: Mapping[str, FrameId], ref: BlobRef) -> bytes:
         held = self._payloads.get(ref.sha256)
         if held is not None:
             return held
