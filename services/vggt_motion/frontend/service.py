@@ -38,6 +38,7 @@ from vggt_motion.errors import (
     VggtMotionError,
 )
 from vggt_motion.frontend.pipeline import FrontendPipeline, KeyframeOutput, Output
+from vggt_motion.frontend.sender import LedgerSender
 from vggt_motion.frontend.spool import Spool
 from vggt_motion.records import BlobRef, Event, EventKind, MotionState, Stream
 from vggt_motion.sources.encoded import PNG
@@ -145,10 +146,15 @@ class _Frontend:
         self._newest_time_ns = 0
         self._capture_times_ns: deque[int] = deque(maxlen=_RATE_FRAMES)
         self._waiting_since: float | None = None  # for the source's next frame
+        self._sender: LedgerSender | None = None
         self._outbox: _Outbox | None = None
         if source.is_live:
             self._outbox = _Outbox(context, self._camera)
             self._outbox.send_all()  # of a process before this one, and then the log says where it was
+        elif (
+            context.config.frontend.disk_policy == "wait"
+        ):  # who lets frames go by must know at once that the disk is full
+            self._sender = LedgerSender(context.ledger, lambda error: context.set_health("waiting", str(error)))
         self._epoch, first_segment = self._take_up() if source.is_live else (0, 0)
         self._pipeline = FrontendPipeline(
             context.config.frontend,
@@ -174,7 +180,8 @@ class _Frontend:
                 if self._is_thinned(frame):
                     continue
                 try:
-                    outputs = self._pipeline.push(frame)
+                    with self._context.numerics:
+                        outputs = self._pipeline.push(frame)
                 except (SourceError, SourceTruncatedError) as error:
                     if not self._source.is_live:
                         raise
@@ -185,11 +192,17 @@ class _Frontend:
                 self._report("working")
         except SourceTruncatedError as error:
             truncation = error
+        except SourceError:
+            self._flush()
+            raise
         finally:
             is_over.set()
         if self._context.stopping.is_set():
             return  # a live source that we closed, not one that ended
-        self._send(self._pipeline.finish())
+        with self._context.numerics:
+            last = self._pipeline.finish()
+        self._send(last)
+        self._flush()
         self._send_ended(truncation)
         if self._outbox is not None:
             self._outbox.send_all()
@@ -197,10 +210,20 @@ class _Frontend:
         if truncation is not None:
             raise truncation
 
+    def _flush(self) -> None:
+        """Return when all that was passed on is acknowledged."""
+        if self._sender is not None and not self._context.stopping.is_set():
+            self._sender.flush()
+
     def _arriving(self) -> Iterator[Frame]:
         """The source's frames; while one is waited for, that is known."""
         self._waiting_since = time.monotonic()
-        for frame in self._source.frames():
+        frames = iter(self._source.frames())
+        while True:
+            with self._context.numerics:
+                frame = next(frames, None)
+            if frame is None:
+                return
             self._waiting_since = None
             self._capture_times_ns.append(frame.capture_time_ns)
             yield frame
@@ -281,12 +304,19 @@ class _Frontend:
         for output in outputs:
             if isinstance(output, KeyframeOutput):
                 keyframe = output.keyframe
-                self._append(Stream.KEYFRAME, keyframe.keyframe_id, keyframe, [output.encoded])
+                self._pass_on(Stream.KEYFRAME, keyframe.keyframe_id, keyframe, [output.encoded])
             else:
                 segment = output.segment
                 # the ledger knows the mask from the first segment on; it is small, and a restart must not forget it
                 blobs = [] if self._mask is None else [self._mask.png]
-                self._append(Stream.SEGMENT, segment.record_id, segment, blobs)
+                self._pass_on(Stream.SEGMENT, segment.record_id, segment, blobs)
+
+    def _pass_on(self, stream: Stream, record_id: str, record: codec.Record, blobs: Sequence[bytes]) -> None:
+        """Have a record appended, after those before it."""
+        if self._sender is None:
+            self._append(stream, record_id, record, blobs)
+        else:
+            self._sender.put(stream, record_id, record, blobs)
 
     def _append(self, stream: Stream, record_id: str, record: codec.Record, blobs: Sequence[bytes] = ()) -> None:
         """Append, waiting for ledger, link and space for as long as it takes; nothing is left out."""

@@ -18,7 +18,7 @@ def test_every_service_is_killed_once_and_nothing_is_lost(
     start: Callable[..., FaultRun], judge: Callable[[str, Outcome], Outcome], generator: random.Random
 ) -> None:
     run = start("run.inference_workers=2", seconds_per_submap=1.0)
-    assert run.wait_until(lambda: run.count(Stream.KEYFRAME) > 3)
+    assert run.wait_until(lambda: run.count(Stream.EVENT) > 0), "the frontend's first record"
     order = list(SERVICES)
     generator.shuffle(order)
     order.remove("frontend")  # while there is still input
