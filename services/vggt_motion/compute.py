@@ -11,6 +11,7 @@ import logging
 import multiprocessing
 import multiprocessing.connection
 import os
+import select
 import signal
 import threading
 import time
@@ -100,7 +101,9 @@ class ComputeChild:
         connection = self.start()
         end = time.monotonic() + deadline_s
         self._guarded(lambda: connection.send((function, args)))
-        while not self._guarded(lambda: connection.poll(_POLL_S)):
+        answer = select.poll()  # the connection's own makes a new selector each time
+        answer.register(connection.fileno(), select.POLLIN)
+        while not answer.poll(_POLL_S * 1000.0):
             if on_tick is not None and not self._tick(on_tick):
                 self.kill()
                 raise ComputeCancelledError("cancelled")

@@ -6,6 +6,7 @@ and the sigma grows with the scatter of the results about it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 
@@ -45,18 +46,7 @@ class FocalEstimate:
         """The estimate as a hint, or None while nothing is known."""
         if not self._weights:
             return None
-        log_focal = _weighted_median(self._log_focals, self._weights)
-        return FocalHint(
-            focal_over_width=math.exp(log_focal),
-            relative_sigma=self._relative_sigma(log_focal),
-            radial_k1=_weighted_median(self._k1s, self._weights),
-            radial_shape=_weighted_median(self._shapes, self._weights),
-        )
-
-    def _relative_sigma(self, log_focal: float) -> float:
-        normalised = np.abs(np.array(self._log_focals) - log_focal) * np.sqrt(self._weights)
-        scatter = _MAD_TO_SIGMA * float(np.median(normalised))
-        return max(1.0, scatter) / math.sqrt(sum(self._weights))
+        return _hint(tuple(self._log_focals), tuple(self._k1s), tuple(self._shapes), tuple(self._weights))
 
     def settled_hint(self) -> FocalHint | None:
         """The hint if it is good enough to judge earlier submaps by it, else None."""
@@ -72,7 +62,23 @@ def fold(qualities: Iterable[SubmapQuality | None]) -> FocalEstimate:
     return estimate
 
 
-def _weighted_median(values: list[float], weights: list[float]) -> float:
+@functools.lru_cache(1024)
+def _hint(
+    log_focals: tuple[float, ...], k1s: tuple[float, ...], shapes: tuple[float, ...], weights: tuple[float, ...]
+) -> FocalHint:
+    """Remembered, because a plan folds all results anew whenever one has come."""
+    log_focal = _weighted_median(log_focals, weights)
+    normalised = np.abs(np.array(log_focals) - log_focal) * np.sqrt(weights)
+    scatter = _MAD_TO_SIGMA * float(np.median(normalised))
+    return FocalHint(
+        focal_over_width=math.exp(log_focal),
+        relative_sigma=max(1.0, scatter) / math.sqrt(sum(weights)),
+        radial_k1=_weighted_median(k1s, weights),
+        radial_shape=_weighted_median(shapes, weights),
+    )
+
+
+def _weighted_median(values: tuple[float, ...], weights: tuple[float, ...]) -> float:
     """The value at half of the total weight, interpolated between the mid-points of the neighbours' weights.
 
     Continuous in values and weights; two results of equal weight give their mean.
