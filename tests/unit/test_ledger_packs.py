@@ -46,6 +46,20 @@ def test_what_was_appended_is_read_again_by_this_and_another_process(
     again.close()
 
 
+def test_a_pack_that_does_not_end_with_a_block_is_read_and_gone_on_with(tmp_path: Path) -> None:
+    """As those that were written by way of the cache."""
+    (tmp_path / "packs").mkdir()
+    (tmp_path / "packs" / "00000001.pack").write_bytes(b"first" + b"second")
+    packs = PackFiles(tmp_path / "packs")
+    before = [Place(1, 0, 5), Place(1, 5, 6)]
+    assert packs.unused_bytes(before) == {}
+    (after,) = packs.append([b"third"])
+    assert after == Place(1, BLOCK_BYTES, 5)
+    assert [packs.read(place) for place in (*before, after)] == [b"first", b"second", b"third"]
+    assert [read_place(tmp_path / "packs", place) for place in (*before, after)] == [b"first", b"second", b"third"]
+    packs.close()
+
+
 def test_what_nobody_refers_to_at_the_end_is_cut_off(tmp_path: Path) -> None:
     packs = PackFiles(tmp_path / "packs")
     (first,) = packs.append([b"first"])
