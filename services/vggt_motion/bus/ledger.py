@@ -88,13 +88,12 @@ class LedgerClient:
     ) -> AppendResult:
         """As :meth:`append`, of an :class:`.calls.AppendRequest` that was encoded before."""
         key = self._bus.keys.rpc("ledger", "append")
-        reply = retry(
+        return retry(
             self._bus,
-            lambda: codec.decode(calls.AppendReply, self._bus.request_among_others(key, payload)),
+            lambda: _append_result(self._bus.request_among_others(key, payload)),
             patience_s=patience_s,
             what=f"append {what}",
         )
-        return AppendResult(reply.sequence, reply.was_known)
 
     def append_all_encoded(
         self, payloads: Sequence[Payload], *, what: str = "records"
@@ -117,12 +116,7 @@ class LedgerClient:
                 patience_s=None,
                 what=f"append {what} and others",
             )
-            for answer in answers:
-                if isinstance(answer, VggtMotionError):
-                    results.append(answer)
-                else:
-                    reply = codec.decode(calls.AppendReply, answer)
-                    results.append(AppendResult(reply.sequence, reply.was_known))
+            results += [answer if isinstance(answer, VggtMotionError) else _append_result(answer) for answer in answers]
             full = next((result for result in results if isinstance(result, DiskFullError)), None)
             if full is not None:  # the others may not overtake it
                 results += [full] * (len(payloads) - len(results))
@@ -215,6 +209,11 @@ class LedgerClient:
         """
         key = self._bus.keys.rpc("ledger", "status")
         return codec.decode(LedgerStatus, self._bus.request(key, codec.encode(calls.StatusRequest())))
+
+
+def _append_result(answer: bytes) -> AppendResult:
+    reply = codec.decode(calls.AppendReply, answer)
+    return AppendResult(reply.sequence, reply.was_known)
 
 
 def _verified(content: bytes, ref: BlobRef) -> bytes:

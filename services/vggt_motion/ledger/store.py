@@ -317,21 +317,15 @@ class Writing(NamedTuple):
     """Contents on their way to the disk."""
 
     places: tuple[Place, ...]  # to which nothing that lasts may refer before they have been waited for
-    wait: Callable[[], None]  # until they are durable; raises what :meth:`Packs.append` does, each time it is called
+    wait: Callable[[], None]
+    """Returns when they are durable; DiskFullError, each time it is called: there is no space, nothing was kept."""
 
 
 class Packs(Protocol):
     """Durable bytes at places that the rows know: those that are too small for a file and too much for the rows."""
 
-    def append(self, contents: Sequence[Content]) -> list[Place]:
-        """Make contents durable, in order; durable on return, under one sync.
-
-        Raises:
-            DiskFullError: there is no space; nothing was kept.
-        """
-
     def begin(self, contents: Sequence[Content]) -> Writing:
-        """As :meth:`append`, to be waited for."""
+        """Make contents durable, in order, under one sync: they are when they have been waited for."""
 
     def read(self, place: Place) -> bytes:
         """What lies at a place; not verified."""
