@@ -48,7 +48,7 @@ def free_port() -> int:
 
 
 def bus_config(endpoint: str, **changes: float) -> BusConfig:
-    return BusConfig(endpoint=endpoint, session=SESSION, lease_s=3.0, **changes)
+    return BusConfig(endpoint=endpoint, session=SESSION, lease_s=4.0, **changes)
 
 
 def event(number: int) -> Event:

@@ -14,6 +14,7 @@ from rich.console import Console
 from vggt_motion import __version__
 from vggt_motion.config import load_config
 from vggt_motion.errors import InputError, SourceTruncatedError, VggtMotionError
+from vggt_motion.memory import keep_freed_memory
 
 app = typer.Typer(
     name="vggt-motion",
@@ -378,6 +379,7 @@ def config_dump(config: ConfigOption = None, assignments: SetOption = None) -> N
 def main() -> None:
     """Entry point of the command: runs it and turns errors into one line and an exit code."""
     logging.captureWarnings(True)
+    keep_freed_memory()
     try:
         code = app(standalone_mode=False)
     except typer.Exit as stop:

@@ -22,6 +22,7 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from vggt_motion.errors import VggtMotionError
+from vggt_motion.memory import keep_freed_memory
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.2
@@ -159,6 +160,7 @@ def _describe(exit_code: int | None) -> str:
 
 
 def _serve(connection: Connection) -> None:
+    keep_freed_memory()
     # Ctrl-C reaches the whole process group: the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()

@@ -36,7 +36,7 @@ class BusConfig(Section):
     session: str = Field(
         "default", pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the session, part of every key"
     )
-    lease_s: float = Field(3.0, gt=0.1, description="link lease: a frozen peer is gone after this")
+    lease_s: float = Field(4.0, gt=0.1, description="link lease: a frozen peer is gone after this")
     connect_timeout_s: float = Field(10.0, gt=0, description="how long to try to reach the router before giving up")
     request_timeout_s: float = Field(10.0, gt=0, description="how long one acknowledged request may take")
     shared_memory: bool = Field(False, description="explicit single-host switch; has hazards, see the documentation")

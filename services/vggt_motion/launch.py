@@ -32,7 +32,8 @@ from vggt_motion.supervise import ServiceCommand, Supervisor
 
 _log = logging.getLogger(__name__)
 _TICK_S = 0.05
-_SUPERVISE_S = 0.25
+_SUPERVISE_S = 0.5
+_FINISHING_S = 0.1  # what is left is said by the recorder's health, which wakes nobody
 _STATUS_INTERVAL_S = 0.5
 _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
@@ -339,7 +340,7 @@ class LocalRun:
                     if has_all and now - finished_at > _RECORDER_TIMEOUT_S:
                         _log.warning("the recorder did not catch up in time; the recording may lack its end")
                         break
-                follower.wait(_SUPERVISE_S)
+                follower.wait(_SUPERVISE_S if finished_at is None else _FINISHING_S)
             if self._interrupts:
                 _take_in_rest(follower, state, LedgerClient(bus))
             on_progress(self._progress(state, watch))

@@ -1,21 +1,64 @@
-"""Messages delivered in a thread that Zenoh starts, which sleeps until there is one."""
+"""How messages come to us: what waits for them, and in which thread.
+
+A thread that waits in a channel of Zenoh's wakes up ten times a second to look for signals. So who waits long waits
+otherwise.
+"""
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Callable
 from typing import Any
 
+import zenoh
 from zenoh import handlers
 
 _JOIN_S = 0.3
+_ONE_ANSWER = 2  # a place more than it needs
+
+
+class PolledAnswer:
+    """The answer to a query that is soon there: the waiting thread itself takes it out of a channel."""
+
+    def __init__(self) -> None:
+        """For one query."""
+        self.handler: Any = handlers.FifoChannel(_ONE_ANSWER)
+
+    def wait(self, channel: Any) -> zenoh.Reply:
+        """The answer.
+
+        Args:
+            channel: what the query returned.
+
+        Raises:
+            zenoh.ZError: there is none.
+        """
+        reply: zenoh.Reply = channel.recv()
+        return reply
+
+
+class WokenAnswer:
+    """The answer to a query that may take long: the waiting thread sleeps until Zenoh's network thread wakes it."""
+
+    def __init__(self) -> None:
+        """For one query."""
+        self._replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+        # In the network thread: neither call waits for anything.
+        self.handler: Any = handlers.Callback(self._replies.put, lambda: self._replies.put(None), indirect=False)
+
+    def wait(self, _: Any) -> zenoh.Reply:
+        """As :meth:`PolledAnswer.wait`."""
+        reply = self._replies.get()
+        if reply is None:
+            raise zenoh.ZError("no answer")
+        return reply
 
 
 class Calls:
     """Calls a function with each message, in a thread that the library starts, one after the other.
 
-    A thread that waits in a channel of ours wakes up ten times a second to look for signals; this one sleeps. But the
-    library lets 256 messages wait for it, whatever their size.
+    It sleeps until there is one. But the library lets 256 messages wait for it, whatever their size.
     """
 
     def __init__(self, function: Callable[[Any], None]) -> None:

@@ -66,7 +66,9 @@ class JobClient:
         self._claims.open_id = claim_id
         request = calls.ClaimRequest(tuple(kinds), tuple(models), worker, wait_s, claim_id)
         timeout_s = wait_s + self._bus.config.request_timeout_s
-        reply = codec.decode(calls.ClaimReply, self._request("claim", codec.encode(request), timeout_s=timeout_s))
+        reply = codec.decode(
+            calls.ClaimReply, self._request("claim", codec.encode(request), timeout_s=timeout_s, is_long_poll=True)
+        )
         self._claims.open_id = None
         return reply.lease
 
@@ -156,8 +158,11 @@ class JobClient:
         request = codec.encode(calls.CancelRequest(tuple(job_ids)))
         return codec.decode(calls.CancelReply, self._request("cancel", request)).cancelled_count
 
-    def _request(self, call: str, payload: bytes, *, timeout_s: float | None = None) -> bytes:
-        return self._bus.request(self._bus.keys.rpc("jobs", call), payload, timeout_s=timeout_s)
+    def _request(
+        self, call: str, payload: bytes, *, timeout_s: float | None = None, is_long_poll: bool = False
+    ) -> bytes:
+        key = self._bus.keys.rpc("jobs", call)
+        return self._bus.request(key, payload, timeout_s=timeout_s, is_long_poll=is_long_poll)
 
 
 def one_line(text: str) -> str:

@@ -1,7 +1,8 @@
 """Joining the bus: our Zenoh configuration, and the session behind a small interface.
 
 The settings follow measurements: shared memory can lose data and leaks segments of killed processes, multicast and
-gossip find strangers, and a link lease of 10 s is too long to notice a frozen peer.
+gossip find strangers, a link lease of 10 s is too long to notice a frozen peer, and a sign of life every fourth part of
+the lease is a quarter of what an idle service costs.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeVar
 
 import zenoh
-from zenoh import handlers
 
 from vggt_motion.bus import calls, codec
+from vggt_motion.bus.delivery import PolledAnswer, WokenAnswer
 from vggt_motion.bus.keys import Keys
 from vggt_motion.bus.parcels import Parcels, open_parcels
 from vggt_motion.bus.pubsub import (
@@ -58,6 +59,7 @@ _BUNDLED_BYTES = 2**20  # longer requests go alone: what each costs apart from i
 _MAX_BUNDLE_BYTES = 8 * 2**20
 _MAX_BUNDLED = 64
 _MIN_BUNDLE_BYTES = _MAX_BUNDLE_BYTES // _MAX_BUNDLED  # a single request, as each counts for so much at least
+_SIGNS_OF_LIFE_PER_LEASE = 2  # over a stream none is lost, only late: by half a lease it may be
 _BUNDLES_UNDER_WAY = 2  # one travels while the other one is being answered
 Kept = TypeVar("Kept", bound=Closable)
 
@@ -78,6 +80,7 @@ def zenoh_config(config: BusConfig, mode: Literal["client", "router"] = "client"
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": config.shared_memory,
         "transport/link/tx/lease": round(config.lease_s * 1000),
+        "transport/link/tx/keep_alive": _SIGNS_OF_LIFE_PER_LEASE,
     }
     if mode == "router":
         settings["listen/endpoints"] = [config.endpoint]
@@ -166,8 +169,23 @@ class Bus:
         """Whether requests have been ended by :meth:`interrupt` or :meth:`close`."""
         return self._interrupted.is_set()
 
-    def request(self, key: str, payload: Payload, *, timeout_s: float | None = None, encoding: str = "") -> bytes:
+    def request(
+        self,
+        key: str,
+        payload: Payload,
+        *,
+        timeout_s: float | None = None,
+        encoding: str = "",
+        is_long_poll: bool = False,
+    ) -> bytes:
         """An acknowledged call: send a query and wait for its one answer.
+
+        Args:
+            key: who is asked for what.
+            payload: the request.
+            timeout_s: None = as the configuration says.
+            encoding: of the payload, where it is not the usual one.
+            is_long_poll: the answer may be seconds away: waiting for it costs nothing, its arrival a little more.
 
         Raises:
             BusUnavailableError: nobody answered, the link is down, or requests were interrupted; may be repeated.
@@ -182,11 +200,12 @@ class Bus:
         parcel = parcels.leave(payload) if key in self._near_keys else None
         is_by_parcel = parcel is not None
         is_answered = False
+        answer = WokenAnswer() if is_long_poll else PolledAnswer()
         try:
             if parcel is None:
-                sample = self._ask(key, joined(payload), parcels.greeting, timeout, encoding)
+                sample = self._ask(key, joined(payload), parcels.greeting, timeout, encoding, answer)
             else:
-                sample = self._ask(key, b"", parcel.attachment, timeout, encoding)
+                sample = self._ask(key, b"", parcel.attachment, timeout, encoding, answer)
             is_answered = True
             attachment = None if sample.attachment is None else sample.attachment.to_bytes()
             if payload and self._parcels.is_near(attachment):
@@ -272,14 +291,22 @@ class Bus:
             raise CodecError(f"{key}: {len(reply.answers)} answers to {len(payloads)} requests")
         return [answer.payload if answer.refusal is None else error_of(answer.refusal) for answer in reply.answers]
 
-    def _ask(self, key: str, payload: bytes, attachment: bytes | None, timeout: float, encoding: str) -> zenoh.Sample:
+    def _ask(
+        self,
+        key: str,
+        payload: bytes,
+        attachment: bytes | None,
+        timeout: float,
+        encoding: str,
+        answer: WokenAnswer | PolledAnswer,
+    ) -> zenoh.Sample:
         """Send a query and wait for its one answer."""
         if self._interrupted.is_set():
             raise BusUnavailableError(f"{key}: stopping")
         try:
-            replies: Any = self._session.get(
+            channel: Any = self._session.get(
                 key,
-                handlers.FifoChannel(2),
+                answer.handler,
                 payload=payload,
                 encoding=encoding or None,
                 attachment=attachment,
@@ -288,9 +315,9 @@ class Bus:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 cancellation_token=self._requests,
             )
-            reply = replies.recv()
+            reply = answer.wait(channel)
         except zenoh.ZError:
-            # A channel that closes without a reply: nobody serves the key, or whoever did has gone.
+            # What closes without a reply: nobody serves the key, or whoever did has gone.
             if self._interrupted.is_set():
                 raise BusUnavailableError(f"{key}: stopping") from None
             raise BusUnavailableError(f"{key}: nobody answers") from None
@@ -298,6 +325,7 @@ class Bus:
             sample: zenoh.Sample = reply.ok
             return sample
         error = reply.err
+        assert error is not None  # one of the two
         if str(error.encoding) != REFUSAL_ENCODING:  # Zenoh's own, such as a timeout
             raise BusUnavailableError(f"{key}: no answer within {timeout:g} s ({error.payload.to_bytes()[:80]!r})")
         try:

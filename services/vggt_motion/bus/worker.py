@@ -16,7 +16,7 @@ from vggt_motion.errors import BusUnavailableError, DiskFullError, InputError, V
 from vggt_motion.records import BlobRef, JobKind, Lease, Stream
 
 _log = logging.getLogger(__name__)
-_CLAIM_WAIT_S = 3.0
+_CLAIM_WAIT_S = 10.0
 _RETRY_S = 0.5
 _HEARTBEATS_PER_LEASE = 4
 _WARM_UP_DEADLINE_S = 1800.0  # no job waits for it, and compilation on a busy machine takes minutes

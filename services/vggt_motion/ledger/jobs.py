@@ -46,7 +46,8 @@ MAX_REPORTS = 1_000
 MAX_WAIT_S = 60.0
 MAX_JOB_ID_BYTES = 240  # the id of the event of its death is longer
 MAX_JOB_PAYLOAD_BYTES = 4 * 2**20
-_LONGEST_PAUSE_S = 1.0
+_LONGEST_PAUSE_S = 10.0  # of a claim between two looks: whatever makes a job ready wakes it
+_HELD_BACK_PAUSE_S = 1.0  # ... but space on the disk wakes nobody
 _FINAL = (JobState.DONE, JobState.DEAD, JobState.CANCELLED)
 
 
@@ -186,16 +187,19 @@ class JobQueue:
                     if self._is_closed or waiter.is_abandoned:
                         return None
                     seen = self._change_count
-                lease = self._try_claim(names, models, worker, claim_id)
-                if lease is not None:
-                    return lease
+                has_lease, has_job = self._look(names, models, worker, claim_id)
+                is_held_back = has_job and not has_lease and not self._may_start()
+                if (has_lease or has_job) and not is_held_back:
+                    lease = self._take(names, models, worker, claim_id)
+                    if lease is not None:
+                        return lease
                 pause_s = min(until_s, self._next_wake_s(names, models)) - self._clock()
                 if until_s <= self._clock():
                     return None
                 with self._condition:
                     if self._change_count == seen:
-                        # Never long: an injected clock knows nothing of real time, and space on the disk wakes nobody.
-                        self._condition.wait(min(max(pause_s, 0.001), _LONGEST_PAUSE_S))
+                        longest_s = _HELD_BACK_PAUSE_S if is_held_back else _LONGEST_PAUSE_S
+                        self._condition.wait(min(max(pause_s, 0.001), longest_s))
         finally:
             with self._condition:
                 self._waiters.remove(waiter)
@@ -394,16 +398,19 @@ class JobQueue:
         wake_s = self._rows.read(lambda reader: reader.next_wake_s(kinds, models, now_s))
         return float("inf") if wake_s is None else wake_s
 
-    def _try_claim(self, kinds: Collection[str], models: Collection[str], worker: str, claim_id: str) -> Lease | None:
+    def _look(self, kinds: Collection[str], models: Collection[str], worker: str, claim_id: str) -> tuple[bool, bool]:
+        """Whether a claim has its lease already, and whether there is a job for it; without a lock.
+
+        Most find nothing, and a transaction costs an fsync.
+        """
+
         def look(reader: Reader) -> tuple[bool, bool]:
             has_lease = bool(claim_id) and reader.find_claim(worker, claim_id) is not None
             return has_lease, has_lease or reader.next_open_job(kinds, models, self._clock()) is not None
 
-        # A look without a lock first: most polls find nothing, and a transaction costs an fsync.
-        has_lease, has_job = self._rows.read(look)
-        if not has_job or not (has_lease or self._may_start()):
-            return None
+        return self._rows.read(look)
 
+    def _take(self, kinds: Collection[str], models: Collection[str], worker: str, claim_id: str) -> Lease | None:
         def change(transaction: Transaction) -> Lease | None:
             now_s = self._clock()
             deadline_s = now_s + self._policy.lease_duration_s

@@ -56,7 +56,7 @@ RESULT_STREAMS: Final = {
     JobKind.PREDICT.value: Stream.SUBMAP.value,
     JobKind.REGISTER.value: Stream.CONSTRAINT.value,
 }
-_TICK_S = 0.5
+_TICK_S = 1.0
 _TICKS_PER_LEASE = 8
 _HEALTH_S = 1.0
 _SIZES_S = 5.0  # the sum over all blobs is not asked for more often

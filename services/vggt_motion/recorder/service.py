@@ -12,8 +12,10 @@ import hashlib
 import logging
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+
+import cv2
 
 from vggt_motion.backend.state import LogState
 from vggt_motion.bus import codec
@@ -47,7 +49,8 @@ from vggt_motion.sources.source import Frame
 
 _log = logging.getLogger(__name__)
 RECORDING_FILE = "run.mcap"
-_REPORT_S = 0.5
+_REPORT_S = 1.0
+_PATIENT_S = 0.5  # between two looks for images of keyframes
 _RECORDS_A_TURN = 100
 _BLOBS_A_TURN = 32
 _FRAME_PATIENCE_S = 1.0  # a keyframe's record may overtake its image
@@ -61,6 +64,7 @@ def main(config: Config, *, directory: Path) -> int:
     """Record the session into ``directory/run.mcap`` until told to stop; returns the exit code of the process."""
 
     def body(context: ServiceContext) -> None:
+        cv2.setNumThreads(1)  # the views are made at leisure, beside the computing that others wait for
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -95,7 +99,7 @@ class _Recorder:
         positions = {stream: self._recording.position(stream.value) for stream in RECORD_OF_STREAM}
         follower = LogFollower(context.bus, positions)
         context.stopping.wakes(follower.wake)
-        self._views.start()
+        self._views.start(on_done=follower.wake)
         try:
             next_report, was_complete = 0.0, False
             while not context.stopping.is_set():
@@ -108,7 +112,7 @@ class _Recorder:
                     # a change of state is sent at once: whoever waits for the recording waits no longer than it takes
                     self._report("idle" if is_complete else "working")
                 if count == 0:
-                    follower.wait(_REPORT_S)
+                    follower.wait(_PATIENT_S if self._pending_keyframes else _REPORT_S)
             self._follow(follower, keep_going=False)
         except OSError as error:
             self._failure = error
@@ -333,8 +337,9 @@ class _ViewThread:
         self._is_busy = False
         self.failure: OSError | None = None
 
-    def start(self) -> None:
-        threading.Thread(target=self._run, name="recorder-views", daemon=True).start()
+    def start(self, on_done: Callable[[], None]) -> None:
+        """``on_done`` is called, from the thread, whenever :attr:`is_done` may have become true."""
+        threading.Thread(target=self._run, args=(on_done,), name="recorder-views", daemon=True).start()
 
     @property
     def is_done(self) -> bool:
@@ -352,7 +357,7 @@ class _ViewThread:
             self._offered = copy
             self._changed.notify_all()
 
-    def _run(self) -> None:
+    def _run(self, on_done: Callable[[], None]) -> None:
         while not self._context.stopping.is_set():
             with self._changed:
                 if self._offered is None:
@@ -375,6 +380,7 @@ class _ViewThread:
             finally:
                 with self._changed:
                     self._is_busy = False
+                on_done()
             self._rest(_VIEW_REST * (time.monotonic() - begin))
 
     def _rest(self, seconds: float) -> None:

@@ -38,7 +38,7 @@ SMALL_SUBMAPS = ("frontend.max_keyframes=4", "frontend.overlap_keyframes=2")
 """The sample in eight submaps instead of three: more to lose, less time each."""
 
 # Leases and heartbeats as short as a busy machine allows, so that a frozen process is noticed within the test.
-QUICK = ("bus.lease_s=1.5", "ledger.lease_duration_s=3", "bus.request_timeout_s=5", "gateway.port=0")
+QUICK = ("bus.lease_s=2", "ledger.lease_duration_s=3", "bus.request_timeout_s=5", "gateway.port=0")
 
 
 @dataclass(frozen=True)
