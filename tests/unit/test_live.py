@@ -107,3 +107,20 @@ def test_new_revisions_and_a_change_of_scale_reach_the_child() -> None:
     step = feed.next_step(state)
     assert not step.is_metric and len(step.nodes) == 3 and len(step.constraints) == 2
     assert [(pose.submap_revision, pose.component) for pose in publish(feed, state).poses] == [(1, 0), (2, 1), (1, 1)]
+
+
+def test_a_live_graph_is_made_at_once_but_waits_for_registrations_that_are_at_work() -> None:
+    pace = live.LivePace()
+    assert pace.wait_s(0, is_registering=False, now_s=0.0) is None, "there is nothing to show"
+    assert pace.wait_s(1, is_registering=False, now_s=0.0) == 0.0, "the first submap needs no registration"
+    pace.solved(1)
+    assert pace.wait_s(1, is_registering=False, now_s=1.0) is None, "nothing is new"
+    assert pace.wait_s(2, is_registering=True, now_s=10.0) == live.REGISTRATION_PATIENCE_S
+    assert pace.wait_s(2, is_registering=True, now_s=10.4) == pytest.approx(live.REGISTRATION_PATIENCE_S - 0.4)
+    assert pace.wait_s(3, is_registering=False, now_s=10.5) == 0.0, "its constraint is there"
+    pace.solved(3)
+    assert pace.wait_s(4, is_registering=True, now_s=20.0) == live.REGISTRATION_PATIENCE_S, "counted from now on"
+    assert pace.wait_s(5, is_registering=True, now_s=20.0 + live.REGISTRATION_PATIENCE_S) == 0.0, "not for ever"
+    pace.solved(5)
+    pace.solved(3)
+    assert pace.wait_s(5, is_registering=False, now_s=30.0) is None, "an older graph takes nothing back"

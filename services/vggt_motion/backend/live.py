@@ -13,6 +13,42 @@ from vggt_motion.backend.state import LogState
 from vggt_motion.config import BackendConfig
 from vggt_motion.records import Constraint, GraphUpdate
 
+REGISTRATION_PATIENCE_S = 1.0
+
+
+class LivePace:
+    """When a live graph is due: at once, but for a submap whose place in the graph is about to be measured.
+
+    Without its registrations a new submap stands apart, and a new revision of one tears the graph in two; a moment
+    later they are there, as a rule. Where registering takes long, what there is is shown all the same.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is solved yet."""
+        self._solved_inputs = -1  # how many submaps and constraints the newest graph was solved from
+        self._since_s: float | None = None  # when the first of those came that it was not solved from
+
+    def wait_s(self, inputs: int, *, is_registering: bool, now_s: float) -> float | None:
+        """Seconds until a live graph is due, if nothing more comes; None: it would say nothing new.
+
+        Args:
+            inputs: number of submaps and constraints in the log.
+            is_registering: whether there are submaps whose registration is still to come.
+            now_s: by a clock that does not jump.
+        """
+        if inputs == 0 or inputs <= self._solved_inputs:
+            self._since_s = None
+            return None
+        if self._since_s is None:
+            self._since_s = now_s
+        return max(0.0, self._since_s + REGISTRATION_PATIENCE_S - now_s) if is_registering else 0.0
+
+    def solved(self, inputs: int) -> None:
+        """A graph was solved from so many, here or by a backend before this one."""
+        if inputs > self._solved_inputs:
+            self._solved_inputs = inputs
+            self._since_s = None
+
 
 @dataclass(frozen=True)
 class LiveStep:

@@ -39,12 +39,13 @@ class _Backend:
         self._log = LogFollower(context.bus)
         self._child = ComputeChild("backend")
         self._live = live.LiveFeed()
+        self._pace = live.LivePace()
         self._submitted: set[str] = set()
         self._is_complete = False
+        self._is_registering = False
         self._awaited: set[str] = set()  # keyframes that a segment names and that have not come
         self._has_unsubmitted = False
         self._retry_at = 0.0
-        self._solved_inputs = -1  # how many submaps and constraints the newest graph was solved from
         self._solve_failures = 0
 
     def serve(self) -> None:
@@ -53,7 +54,9 @@ class _Backend:
             self._child.start()  # its imports take longer than the first submap should wait for
             while not self._context.stopping.is_set():
                 if not self._pump() and not self._solve():
-                    self._log.wait(_RETRY_S if self._has_unsubmitted else _IDLE_S)
+                    until_due_s = self._until_live_graph_s()
+                    idle_s = _RETRY_S if self._has_unsubmitted else _IDLE_S
+                    self._log.wait(idle_s if until_due_s is None else min(idle_s, until_due_s))
         except ComputeCancelledError:
             return
         finally:
@@ -90,6 +93,7 @@ class _Backend:
 
     def _submit(self) -> None:
         called_for = planner.next_jobs(self._state, self._config)
+        self._is_registering = any(job.kind is JobKind.REGISTER for job in called_for)
         self._is_complete = not called_for and planner.is_complete(self._state, self._config)
         planned = [job for job in called_for if job.job_id not in self._submitted]
         self._has_unsubmitted = bool(planned)
@@ -136,7 +140,7 @@ class _Backend:
             return False
         is_final = self._is_complete
         inputs = state.graph_input_count
-        if not is_final and (inputs == 0 or inputs <= max(self._solved_inputs, graph.revision if graph else -1)):
+        if not is_final and self._until_live_graph_s() != 0.0:
             return False
         try:
             # The revision counts what went in, so that a backend that was killed and started again makes it again.
@@ -151,7 +155,7 @@ class _Backend:
             self._context.stopping.wait(_RETRY_S)
             return True
         self._solve_failures = 0
-        self._solved_inputs = inputs
+        self._pace.solved(inputs)
         try:
             self._append(update)
         except RequestRefusedError as error:
@@ -160,6 +164,15 @@ class _Backend:
             # A backend before this one had seen as many records, but not the same ones: its graph stands for now.
             _log.info("live graph not kept", extra={"reason": str(error)})
         return True
+
+    def _until_live_graph_s(self) -> float | None:
+        """See :meth:`.live.LivePace.wait_s`."""
+        graph = self._state.latest_graph()
+        if graph is not None:
+            self._pace.solved(graph.revision)  # perhaps by a backend before this one
+        return self._pace.wait_s(
+            self._state.graph_input_count, is_registering=self._is_registering, now_s=time.monotonic()
+        )
 
     def _solve_final(self, revision: int) -> GraphUpdate:
         state = self._state
