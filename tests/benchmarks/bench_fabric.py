@@ -329,8 +329,12 @@ class Watched:
             self._alive = {process.pid for process in processes}
             for process in processes:
                 with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):
-                    # each time: between fork and exec a child has its parent's command line
-                    self._names[process.pid] = self._name_of(process)
+                    # each time: between fork and exec a child has its parent's command line; one that has ended and is
+                    # not taken leave of yet has none, but says what it used in all
+                    if process.status() != psutil.STATUS_ZOMBIE:
+                        self._names[process.pid] = self._name_of(process)
+                    elif process.pid not in self._names:
+                        continue
                     times = process.cpu_times()
                     self.used[process.pid] = times.user + times.system
 

@@ -28,7 +28,7 @@ _LEDGER_INTERVAL_S = 2.0
 _BLOB_PATIENCE_S = 3.0
 _RECORDS_A_TURN = 500
 _SHUTDOWN_S = 1.0
-_HTTP_TICK_S = 1.0
+_HTTP_TICK_S = 5.0  # answers carry a date that is at most so old
 
 
 def main(config: Config) -> int:
@@ -180,7 +180,7 @@ class HttpServer:
 
 
 class _HttpLoop(uvicorn.Server):
-    """Uvicorn's server, whose own loop looks ten times a second whether it shall end."""
+    """Uvicorn's server, whose own loop looks ten times a second whether it shall end: this one is told."""
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)

@@ -16,7 +16,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from vggt_motion.ledger.log import MAX_PAYLOAD_TYPE_BYTES, Store, check_id, check_record
@@ -80,9 +80,11 @@ class JobPolicy:
 class _Waiter:
     """A claim that waits for a job."""
 
-    def __init__(self, worker: str) -> None:
+    def __init__(self, worker: str, kinds: Set[str]) -> None:
         self.worker = worker
+        self.kinds = kinds
         self.is_abandoned = False
+        self.has_news = threading.Event()
 
 
 class JobQueue:
@@ -120,9 +122,8 @@ class JobQueue:
         self._clock = clock
         self._may_start = may_start or (lambda: store.is_accepting)
         self._new_lease_id = new_lease_id or (lambda: uuid.uuid4().hex)
-        self._condition = threading.Condition()
+        self._lock = threading.Lock()
         self._waiters: list[_Waiter] = []
-        self._change_count = 0  # so that no change between a look and a wait is slept through
         self._is_closed = False
         self._last_tick_s = clock()
         self._recover()
@@ -146,7 +147,7 @@ class JobQueue:
             return Submitted(new_count, len(jobs) - new_count)
 
         submitted = self._rows.write(change)
-        self._wake()
+        self._wake({job.kind.value for job in jobs})
         return submitted
 
     def claim(
@@ -178,15 +179,15 @@ class JobQueue:
             raise InvalidRequestError("a claim needs at least one kind and a finite wait_s that is not negative")
         names = {kind.value for kind in kinds}
         until_s = self._clock() + min(wait_s, MAX_WAIT_S)
-        waiter = _Waiter(worker)
-        with self._condition:
+        waiter = _Waiter(worker, names)
+        with self._lock:
             self._waiters.append(waiter)
         try:
             while True:
-                with self._condition:
-                    if self._is_closed or waiter.is_abandoned:
-                        return None
-                    seen = self._change_count
+                # Before the look: no change between it and the wait is slept through.
+                waiter.has_news.clear()
+                if self._is_closed or waiter.is_abandoned:
+                    return None
                 has_lease, has_job = self._look(names, models, worker, claim_id)
                 is_held_back = has_job and not has_lease and not self._may_start()
                 if (has_lease or has_job) and not is_held_back:
@@ -196,12 +197,10 @@ class JobQueue:
                 pause_s = min(until_s, self._next_wake_s(names, models)) - self._clock()
                 if until_s <= self._clock():
                     return None
-                with self._condition:
-                    if self._change_count == seen:
-                        longest_s = _HELD_BACK_PAUSE_S if is_held_back else _LONGEST_PAUSE_S
-                        self._condition.wait(min(max(pause_s, 0.001), longest_s))
+                longest_s = _HELD_BACK_PAUSE_S if is_held_back else _LONGEST_PAUSE_S
+                waiter.has_news.wait(min(max(pause_s, 0.001), longest_s))
         finally:
-            with self._condition:
+            with self._lock:
                 self._waiters.remove(waiter)
 
     def heartbeat(self, lease_id: str) -> bool:
@@ -308,7 +307,7 @@ class JobQueue:
 
     def release_worker(self, worker: str) -> int:
         """End the leases and waiting claims of a worker whose liveliness token vanished; returns how many leases."""
-        with self._condition:
+        with self._lock:
             for waiter in self._waiters:
                 waiter.is_abandoned = waiter.is_abandoned or waiter.worker == worker
         self._wake()
@@ -341,8 +340,7 @@ class JobQueue:
 
     def close(self) -> None:
         """End all waiting claims and answer new ones with nothing."""
-        with self._condition:
-            self._is_closed = True
+        self._is_closed = True
         self._wake()
 
     def _recover(self) -> None:
@@ -496,10 +494,12 @@ class JobQueue:
         if transaction.find_record(event.stream, event.record_id) is None:
             self._store.add(transaction, event)
 
-    def _wake(self) -> None:
-        with self._condition:
-            self._change_count += 1
-            self._condition.notify_all()
+    def _wake(self, kinds: Set[str] | None = None) -> None:
+        """Have the claims look again that ask for jobs of these kinds, or all."""
+        with self._lock:
+            for waiter in self._waiters:
+                if kinds is None or not waiter.kinds.isdisjoint(kinds):
+                    waiter.has_news.set()
 
 
 def _report(job: JobRow) -> JobReport:

@@ -23,14 +23,18 @@ _ORTHONORMAL_TOLERANCE = 1e-5
 
 def rotation_problem(values: list[float]) -> str | None:
     """Nine values, row by row, are a proper rotation (to 1e-5)."""
-    a, b, c = values[0:3], values[3:6], values[6:9]
-    for row, other, expected in ((a, a, 1.0), (b, b, 1.0), (c, c, 1.0), (a, b, 0.0), (a, c, 0.0), (b, c, 0.0)):
-        dot = row[0] * other[0] + row[1] * other[1] + row[2] * other[2]
-        if not abs(dot - expected) <= _ORTHONORMAL_TOLERANCE:
-            return "is not a rotation: rows are not orthonormal"
-    determinant = (
-        a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
+    a0, a1, a2, b0, b1, b2, c0, c1, c2 = values
+    # Written out: it is done for each pose of each record in each process that reads it.
+    if not (
+        abs(a0 * a0 + a1 * a1 + a2 * a2 - 1.0) <= _ORTHONORMAL_TOLERANCE
+        and abs(b0 * b0 + b1 * b1 + b2 * b2 - 1.0) <= _ORTHONORMAL_TOLERANCE
+        and abs(c0 * c0 + c1 * c1 + c2 * c2 - 1.0) <= _ORTHONORMAL_TOLERANCE
+        and abs(a0 * b0 + a1 * b1 + a2 * b2) <= _ORTHONORMAL_TOLERANCE
+        and abs(a0 * c0 + a1 * c1 + a2 * c2) <= _ORTHONORMAL_TOLERANCE
+        and abs(b0 * c0 + b1 * c1 + b2 * c2) <= _ORTHONORMAL_TOLERANCE
+    ):
+        return "is not a rotation: rows are not orthonormal"
+    determinant = a0 * (b1 * c2 - b2 * c1) - a1 * (b0 * c2 - b2 * c0) + a2 * (b0 * c1 - b1 * c0)
     return None if determinant > 0.0 else "is not a rotation: it mirrors"
 
 
