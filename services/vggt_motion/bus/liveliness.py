@@ -19,6 +19,7 @@ from vggt_motion.records import HealthReport
 
 _log = logging.getLogger(__name__)
 HEALTH_INTERVAL_S = 1.0
+_SETTLE_S = 0.05  # a worker that is idle for a moment between two jobs, or works for one, need not say so
 _JOIN_S = 0.5
 _MAX_SERVICES = 4096
 
@@ -39,7 +40,7 @@ class Announcement:
         self._thread.start()
 
     def publish_now(self) -> None:
-        """Send a report at once: a change of state should not wait a second."""
+        """Send a report soon: a change of state should not wait a second."""
         self._changed.set()
 
     def close(self) -> None:
@@ -63,7 +64,8 @@ class Announcement:
                 _log.warning("health not sent", extra={"reason": str(error)})
             if is_last:
                 return
-            self._changed.wait(HEALTH_INTERVAL_S)
+            if self._changed.wait(HEALTH_INTERVAL_S):
+                self._closing.wait(_SETTLE_S)
 
 
 def announce(bus: Bus, service: str, instance: str, health: Callable[[], HealthReport]) -> Announcement:
