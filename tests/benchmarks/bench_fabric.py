@@ -11,9 +11,9 @@ rounds are repeated, so that a disk that has a bad minute has it for all.
 
 Then one ``vggt-motion run`` of a source, whose processes are watched. Numerics are the computing children, the frames
 and pixels in the frontend, the trajectories and maps in the recording (of both the processor time of the threads in the
-pure functions, which the services count in place), and the results that ``run`` writes after the final graph;
-everything else after start-up is fabric. Start-up ends with the frontend's first record: until then the others import,
-open their files and start their children.
+pure functions, which the services count in place, and of the frontend that of FFmpeg's threads), and the results that
+``run`` writes after the final graph; everything else after start-up is fabric. Start-up ends with the frontend's first
+record: until then the others import, open their files and start their children.
 """
 
 from __future__ import annotations
@@ -317,6 +317,7 @@ class Watched:
         self._run = run
         self._names: dict[int, str] = {}
         self._alive: set[int] = set()
+        self._decoding: dict[int, float] = {}
         self.used: dict[int, float] = {}
 
     def has(self, name: str) -> bool:
@@ -337,6 +338,18 @@ class Watched:
                         continue
                     times = process.cpu_times()
                     self.used[process.pid] = times.user + times.system
+                    if self._names[process.pid] == "frontend":
+                        self._look_at_decoder(process)
+
+    def decoding_s(self) -> float:
+        """CPU seconds of the threads in which FFmpeg turns video into pixels; they bear its name."""
+        return sum(self._decoding.values())
+
+    def _look_at_decoder(self, process: psutil.Process) -> None:
+        for thread in process.threads():
+            with contextlib.suppress(OSError):
+                if Path(f"/proc/{process.pid}/task/{thread.id}/comm").read_text().startswith("av:"):
+                    self._decoding[thread.id] = thread.user_time + thread.system_time
 
     def by_name(self) -> dict[str, float]:
         """CPU seconds of each service, up to the last look."""
@@ -413,6 +426,7 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
     used = {name: seconds - start_up.get(name, 0.0) for name, seconds in watched.by_name().items()}
     numerics = {name: seconds for name, seconds in used.items() if name.endswith(" compute")}
     numerics |= {name: seconds for name, seconds in in_place.cpu_s.items() if seconds > 0.0}
+    numerics["frontend"] = numerics.get("frontend", 0.0) + watched.decoding_s()
     numerics["run"] = max(0.0, used["run"] - (run_until_graph - start_up.get("run", 0.0)))
     services = [name for name in used if not name.endswith(" compute")]
     row = {f"{name}_fabric_s": used[name] - numerics.get(name, 0.0) for name in services}

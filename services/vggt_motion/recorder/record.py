@@ -194,13 +194,21 @@ class Recording:
             CodecError: the frame cannot be described in Foxglove's terms.
         """
         payload = encode_image(frame.encoded, frame.media_type, frame.capture_time_ns, frame_id.camera)
+        return self.add_image(frame_id, frame.capture_time_ns, payload)
+
+    def add_image(self, frame_id: FrameId, capture_time_ns: int, payload: bytes) -> bool:
+        """As :meth:`add_frame`, of a foxglove.CompressedImage that is recorded as it came.
+
+        Raises:
+            CodecError: its index is out of range.
+        """
         if not 0 <= frame_id.index <= _MAX_SEQUENCE:
             raise CodecError(f"frame index {frame_id.index} is out of range")
         with self._lock:
             known = self._frames.setdefault((frame_id.camera, frame_id.epoch), IndexSet())
             if frame_id.index in known:
                 return False
-            self._add(_image_channel(frame_id.camera, frame_id.epoch), frame_id.index, frame.capture_time_ns, payload)
+            self._add(_image_channel(frame_id.camera, frame_id.epoch), frame_id.index, capture_time_ns, payload)
             known.add(frame_id.index)
         return True
 

@@ -156,14 +156,14 @@ class _Recorder:
     def _on_image(self, sample: Sample) -> None:
         camera = sample.key.split("/")[-2]
         try:
-            image = decode_image(sample.payload, sample.attachment)
+            payload = sample.payload
+            image = decode_image(payload, sample.attachment)
             if image.header is None or not image.header.is_accepted:
                 # Which of these the frontend takes, and under which number, its segments will say.
                 self._recording.add_unnumbered_frame(camera, image.encoded, image.media_type, image.capture_time_ns)
             else:
                 frame_id = FrameId(camera, image.header.epoch, image.header.frame_index)
-                frame = Frame(frame_id.index, image.capture_time_ns, image.encoded, image.media_type)
-                self._recording.add_frame(frame_id, frame)
+                self._recording.add_image(frame_id, image.capture_time_ns, payload)
                 self._payloads.put(frame_id, image.encoded)
         except CodecError as error:
             self._refused_images += 1
