@@ -156,9 +156,8 @@ def test_closing_ends_a_waiting_call(endpoint: str, bus: Bus) -> None:
     assert outcome == [None]
 
 
-def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: Bus) -> None:
-    entries = [entry(number) for number in range(3)]
-    statuses: list[LedgerStatus | None] = []
+def serve_all_streams(ledger: Bus, entries: list[LogEntry], asker: Bus) -> None:
+    """Be a ledger that holds these events, and what is added to them."""
 
     def status(_: str, __: bytes) -> bytes:
         positions = (StreamPosition("event", len(entries)),)
@@ -169,9 +168,37 @@ def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: 
         held = entries[request.from_sequence :] if request.stream == "event" else []
         return codec.encode(calls.ReadReply(tuple(held), len(entries) if request.stream == "event" else 0))
 
+    serve(ledger, ledger.keys.rpc("ledger", "status"), status, asker=asker)
+    serve(ledger, ledger.keys.rpc("ledger", "read"), read, asker=asker)
+
+
+def test_a_ledger_that_appears_is_asked_at_once(endpoint: str, bus: Bus) -> None:
+    entries = [entry(0)]
     with connect(endpoint) as ledger:
-        serve(ledger, ledger.keys.rpc("ledger", "status"), status, asker=bus)
-        serve(ledger, ledger.keys.rpc("ledger", "read"), read, asker=bus)
+        serve_all_streams(ledger, entries, bus)
+        asked = threading.Event()
+        log = LogFollower(bus, on_status=lambda status: asked.set() if status else None, interval_s=3600.0)
+        taken: list[str] = []
+
+        def has(count: int) -> bool:
+            log.wait(0.2)
+            taken.extend(record.event_id for record in log.poll() if isinstance(record, Event))
+            return len(taken) == count
+
+        wait_until(lambda: has(1))
+        assert asked.wait(10.0)
+        entries.append(entry(1))  # never published, as while the link was down
+        assert not has(2)
+        ledger.declare_token(ledger.keys.alive("ledger", "back"))
+        wait_until(lambda: has(2))
+        log.close()
+
+
+def test_all_streams_share_one_question_about_what_was_lost(endpoint: str, bus: Bus) -> None:
+    entries = [entry(number) for number in range(3)]
+    statuses: list[LedgerStatus | None] = []
+    with connect(endpoint) as ledger:
+        serve_all_streams(ledger, entries, bus)
         log = LogFollower(bus, {Stream.EVENT: 1}, on_status=statuses.append, interval_s=0.1)
         taken: list[str] = []
 

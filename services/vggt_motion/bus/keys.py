@@ -60,9 +60,9 @@ class Keys:
         """Liveliness token of one process."""
         return f"{self.prefix}/alive/{_checked(service)}/{_checked(instance)}"
 
-    def all_alive(self) -> str:
-        """Liveliness tokens of all processes."""
-        return f"{self.prefix}/alive/*/*"
+    def all_alive(self, service: str | None = None) -> str:
+        """Liveliness tokens of all processes, or of those of one service."""
+        return f"{self.prefix}/alive/{'*' if service is None else _checked(service)}/*"
 
     def health(self, service: str, instance: str) -> str:
         """Health of one process, once a second: HealthReport."""

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 
-from vggt_motion.bus.follow import POLL_S, Follower, published_entries
+from vggt_motion.bus.follow import Follower, published_entries
 from vggt_motion.bus.keys import last_chunk
 from vggt_motion.bus.ledger import LedgerClient
 from vggt_motion.bus.session import Bus, Sample
@@ -14,6 +14,7 @@ from vggt_motion.errors import BusUnavailableError, VggtMotionError
 from vggt_motion.records import Constraint, Event, GraphUpdate, Keyframe, LedgerStatus, Segment, Stream, SubmapGeometry
 
 _log = logging.getLogger(__name__)
+_POLL_S = 10.0
 _RETRY_S = 0.25
 _JOIN_S = 1.0
 LogRecord = Keyframe | Segment | SubmapGeometry | Constraint | GraphUpdate | Event
@@ -37,7 +38,7 @@ class LogFollower:
         positions: Mapping[Stream, int] | None = None,
         *,
         on_status: Callable[[LedgerStatus | None], None] | None = None,
-        interval_s: float = 2.0 * POLL_S,
+        interval_s: float = _POLL_S,
     ) -> None:
         """Start to follow.
 
@@ -46,13 +47,15 @@ class LogFollower:
             positions: first record to deliver of each stream; 0 where it names none.
             on_status: told what the ledger says of itself whenever it was asked; None: it did not answer. Called from
                 a thread of ours.
-            interval_s: how often the ledger is asked; a lost last message shows up after this at the latest.
+            interval_s: how often the ledger is asked; a lost last message shows up after this at the latest. It is
+                asked besides when it appears, anew or behind a link that was cut.
         """
         self._ledger = LedgerClient(bus)
         self._on_status = on_status
         self._interval_s = interval_s
         self._news = threading.Event()
-        self._closing = threading.Event()
+        self._is_due = threading.Event()
+        self._is_closed = False
         first = positions or {}
         self.followers: dict[Stream, Follower[LogRecord]] = {
             stream: Follower(bus, stream, cls, from_sequence=first.get(stream, 0), on_news=self._news.set)
@@ -60,6 +63,7 @@ class LogFollower:
         }
         self._by_name = {stream.value: follower for stream, follower in self.followers.items()}
         self._subscription = bus.subscribe(bus.keys.all_logs(), self._on_sample, is_small=True)
+        self._liveliness = bus.watch_liveliness(bus.keys.all_alive("ledger"), self._on_ledger)
         self._thread = threading.Thread(target=self._watch, name="watch the log", daemon=True)
         self._thread.start()
 
@@ -88,8 +92,10 @@ class LogFollower:
 
     def close(self) -> None:
         """Stop following."""
-        self._closing.set()
+        self._is_closed = True
+        self._is_due.set()
         self._subscription.close()
+        self._liveliness.close()
         for follower in self.followers.values():
             follower.close()
         self._thread.join(_JOIN_S)
@@ -100,10 +106,18 @@ class LogFollower:
             for entry in published_entries(sample):
                 follower.offer(entry)
 
+    def _on_ledger(self, _: str, is_alive: bool) -> None:
+        if is_alive:
+            self._is_due.set()
+
     def _watch(self) -> None:
         """Ask the ledger for the ends of all streams now and then: a publication may be lost."""
         wait_s = 0.0
-        while not self._closing.wait(wait_s):
+        while True:
+            self._is_due.wait(wait_s)
+            self._is_due.clear()
+            if self._is_closed:
+                return
             wait_s = self._interval_s
             status: LedgerStatus | None = None
             try:
