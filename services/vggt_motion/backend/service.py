@@ -166,8 +166,10 @@ class _Backend:
         return True
 
     def _until_live_graph_s(self) -> float | None:
-        """See :meth:`.live.LivePace.wait_s`."""
+        """See :meth:`.live.LivePace.wait_s`; after the final graph, whatever still comes, none is due."""
         graph = self._state.latest_graph()
+        if graph is not None and graph.is_final:
+            return None
         if graph is not None:
             self._pace.solved(graph.revision)  # perhaps by a backend before this one
         return self._pace.wait_s(
