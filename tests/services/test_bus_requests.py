@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Sequence
@@ -55,25 +56,34 @@ def test_answers_and_refusals_come_back_as_what_they_are(bus: Bus, endpoint: str
         assert bus.request(bus.keys.rpc("test", "echo"), b"still here") == b"still here"
 
 
-def test_no_reply_is_a_failure(bus: Bus) -> None:
+either_way = pytest.mark.parametrize("is_long_poll", [False, True])
+
+
+@either_way
+def test_no_reply_is_a_failure(bus: Bus, is_long_poll: bool) -> None:
     with pytest.raises(BusUnavailableError, match="nobody answers"):
-        bus.request(bus.keys.rpc("test", "nothing"), b"")
+        bus.request(bus.keys.rpc("test", "nothing"), b"", is_long_poll=is_long_poll)
 
 
-def test_a_slow_answer_times_out(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+@either_way
+def test_a_slow_answer_times_out(bus: Bus, endpoint: str, tmp_path: Path, is_long_poll: bool) -> None:
     with running(tmp_path, "answer", endpoint):
         echo_when_ready(bus)
+        assert bus.request(bus.keys.rpc("test", "echo"), b"x", is_long_poll=is_long_poll) == b"x"
         with pytest.raises(BusUnavailableError, match=r"no answer within 0\.3 s"):
-            bus.request(bus.keys.rpc("test", "slow"), b"", timeout_s=0.3)
+            bus.request(bus.keys.rpc("test", "slow"), b"", timeout_s=0.3, is_long_poll=is_long_poll)
 
 
-def test_an_answerer_that_is_killed_ends_the_request(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+@either_way
+def test_an_answerer_that_is_killed_ends_the_request(
+    bus: Bus, endpoint: str, tmp_path: Path, is_long_poll: bool
+) -> None:
     with running(tmp_path, "answer", endpoint) as answerer:
         echo_when_ready(bus)
         timer = threading.Timer(0.3, answerer.kill)
         timer.start()
         with pytest.raises(BusUnavailableError, match="nobody answers"):
-            bus.request(bus.keys.rpc("test", "slow"), b"", timeout_s=60.0)
+            bus.request(bus.keys.rpc("test", "slow"), b"", timeout_s=60.0, is_long_poll=is_long_poll)
         timer.join()
 
 
@@ -340,11 +350,15 @@ def test_leaving_does_not_wait_for_handlers_that_do_not_end_and_flushes_all_the_
         assert got[-20:] == [f"{number:04d}".encode() for number in range(20)]
 
 
-def test_interrupt_ends_requests_under_way_and_refuses_new_ones(bus: Bus, endpoint: str, tmp_path: Path) -> None:
+@either_way
+def test_interrupt_ends_requests_under_way_and_refuses_new_ones(
+    bus: Bus, endpoint: str, tmp_path: Path, is_long_poll: bool
+) -> None:
+    slow = functools.partial(bus.request, bus.keys.rpc("test", "slow"), b"", timeout_s=60.0, is_long_poll=is_long_poll)
     with running(tmp_path, "answer", endpoint):
         echo_when_ready(bus)
         with ThreadPoolExecutor(4) as pool:
-            pending = [pool.submit(bus.request, bus.keys.rpc("test", "slow"), b"", timeout_s=60.0) for _ in range(4)]
+            pending = [pool.submit(slow) for _ in range(4)]
             time.sleep(0.3)
             bus.interrupt()
             for future in pending:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import psutil
 import pytest
 
@@ -30,6 +31,21 @@ def test_result_comes_back_from_another_process_that_is_kept(child: ComputeChild
     first = child.call(os.getpid, deadline_s=30)
     assert first != os.getpid()
     assert child.call(os.getpid, deadline_s=30) == first
+
+
+def _shortened(images: list[bytes], by: int, *rest: object) -> tuple[list[bytes], object]:
+    return [image[by:] for image in images], rest
+
+
+def test_long_bytes_come_over_as_they_are_both_ways(child: ComputeChild) -> None:
+    sizes = (0, 1, 32 * 2**10 - 1, 32 * 2**10, 32 * 2**10 + 1, 3_000_000)
+    images = [bytes([number]) * size for number, size in enumerate(sizes)]
+    rest = {"again": images[-1], "view": bytearray(100_000), "array": np.arange(100_000), "none": None}
+    shortened, came = child.call(_shortened, images, 1, rest, deadline_s=30)
+    assert shortened == [image[1:] for image in images]
+    assert isinstance(came, tuple) and came[0].keys() == rest.keys()
+    assert (came[0]["again"], came[0]["view"], came[0]["none"]) == (rest["again"], rest["view"], None)
+    np.testing.assert_array_equal(came[0]["array"], rest["array"])
 
 
 def test_an_exception_keeps_its_message_and_traceback(child: ComputeChild) -> None:

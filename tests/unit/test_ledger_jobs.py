@@ -192,6 +192,49 @@ def test_a_waiting_claim_gets_a_job_that_comes_later(tmp_path: Path) -> None:
     ledger.close()
 
 
+@pytest.mark.parametrize("cause", ["submit", "fail", "release", "deadline"])
+def test_whatever_makes_a_job_ready_wakes_the_claims_that_it_is_for(tmp_path: Path, cause: str) -> None:
+    """Between two looks of its own accord a claim lets ten seconds pass: it must not need one."""
+    policy = JobPolicy(retry_backoff_s=0.01, lease_duration_s=0.2)
+    ledger = open_ledger(tmp_path / "session", clock=time.monotonic, policy=policy)  # type: ignore[arg-type]
+    if cause != "submit":
+        ledger.jobs.submit([predict("a")])
+        lease = claim(ledger, "inference/b")
+    leases: dict[str, Lease | None] = {}
+
+    def wait_for(kind: JobKind) -> None:
+        leases[kind] = ledger.jobs.claim((kind,), (), "inference/a", wait_s=20.0)
+
+    threads = [threading.Thread(target=wait_for, args=(kind,)) for kind in (JobKind.PREDICT, JobKind.REGISTER)]
+    for thread in threads:
+        thread.start()
+    while len(ledger.jobs._waiters) < 2:
+        time.sleep(0.001)
+    time.sleep(0.1)  # they have looked, and sleep
+    begin = time.monotonic()
+    if cause == "submit":
+        ledger.jobs.submit([predict("a")])
+    elif cause == "fail":
+        ledger.jobs.fail("a", lease.lease_id, "no")
+    elif cause == "release":
+        ledger.jobs.release_worker("inference/b")
+    else:
+        time.sleep(policy.lease_duration_s)
+        while not ledger.jobs.tick():
+            time.sleep(0.01)
+    threads[0].join()
+    assert time.monotonic() - begin < 5.0
+    found = leases[JobKind.PREDICT]
+    assert found is not None and found.job.job_id == "a"
+    assert JobKind.REGISTER not in leases, "there is nothing for it yet"
+    ledger.jobs.submit([Job("r", JobKind.REGISTER, b"", "t")])
+    threads[1].join()
+    assert time.monotonic() - begin < 9.0
+    found = leases[JobKind.REGISTER]
+    assert found is not None and found.job.job_id == "r"
+    ledger.close()
+
+
 def test_a_claim_waits_no_longer_than_asked(tmp_path: Path) -> None:
     ledger = open_ledger(tmp_path / "session", clock=time.monotonic)  # type: ignore[arg-type]
     assert ledger.jobs.claim(PREDICT, (), "inference/a", wait_s=0.01) is None
