@@ -170,12 +170,15 @@ class _Pickler(pickle.Pickler):
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self.left_out: list[bytes] = []
+        self._numbers: dict[int, int] = {}  # by identity, as a pickle's own: what is there twice is sent once
 
     def persistent_id(self, obj: Any) -> int | None:
         if type(obj) is not bytes or len(obj) < _LARGE_BYTES:
             return None
-        self.left_out.append(obj)
-        return len(self.left_out) - 1
+        number = self._numbers.setdefault(id(obj), len(self.left_out))
+        if number == len(self.left_out):
+            self.left_out.append(obj)
+        return number
 
 
 class _Unpickler(pickle.Unpickler):

@@ -38,7 +38,7 @@ _STATUS_INTERVAL_S = 0.5
 _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
 _REST_TIMEOUT_S = 5.0
-_RECORDER_QUIET_S = 2.0  # no frame for so long: those that are missing went by while no recorder was there
+_RECORDER_QUIET_S = 4.0  # no frame for so long: those that are missing went by while no recorder was there
 _LOG_PATIENCE_S = 10.0  # what the frontend appended last is seen here after this at the latest
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
@@ -324,6 +324,8 @@ class LocalRun:
                     next_status = now + _STATUS_INTERVAL_S
                     on_progress(self._progress(state, watch))
                 is_absent = state.stream_ended is None and supervisor.exit_code("frontend") is not None
+                if is_absent and absent_since is None:
+                    _ask_for_ends(follower, LedgerClient(bus))
                 absent_since = (absent_since or now) if is_absent else None
                 if absent_since is not None and now - absent_since > _LOG_PATIENCE_S:
                     _log.warning("the frontend was ended before its input was, starting it again")
@@ -333,7 +335,7 @@ class LocalRun:
                     finished_at = finished_at or now
                     # The streams are not ordered mutually, and a publication may be lost: what the graph speaks of
                     # need not be here yet.
-                    ends = ends or _ends_of(LedgerClient(bus))
+                    ends = ends or _ask_for_ends(follower, LedgerClient(bus))
                     has_all = ends is not None and _has_come(follower, ends)
                     if has_all and recorded.is_complete(state, follower.positions(), now):
                         break
@@ -435,7 +437,7 @@ class _RecorderProgress:
 def _take_in_rest(follower: LogFollower, state: LogState, ledger: LedgerClient) -> None:
     """Fold what the ledger has acknowledged up to now, so that an interrupted run shows all that was done."""
     end = time.monotonic() + _REST_TIMEOUT_S
-    ends = _ends_of(ledger)
+    ends = _ask_for_ends(follower, ledger)
     if ends is None:
         _log.warning("the ledger did not answer any more; its last records may be missing")
         return
@@ -447,12 +449,18 @@ def _take_in_rest(follower: LogFollower, state: LogState, ledger: LedgerClient) 
         time.sleep(_TICK_S)
 
 
-def _ends_of(ledger: LedgerClient) -> Mapping[str, int] | None:
-    """Next sequence number of every stream that has records; None: the ledger does not answer."""
+def _ask_for_ends(follower: LogFollower, ledger: LedgerClient) -> Mapping[str, int] | None:
+    """Have everything taken in that there is by now, though its publication be lost.
+
+    Returns:
+        Next sequence number of every stream that has records; None: the ledger does not answer.
+    """
     try:
-        return {entry.stream: entry.next_sequence for entry in ledger.status().positions}
+        ends = {entry.stream: entry.next_sequence for entry in ledger.status().positions}
     except BusError:
         return None
+    follower.expect(ends)
+    return ends
 
 
 def _has_come(follower: LogFollower, ends: Mapping[str, int]) -> bool:

@@ -48,6 +48,16 @@ def test_long_bytes_come_over_as_they_are_both_ways(child: ComputeChild) -> None
     np.testing.assert_array_equal(came[0]["array"], rest["array"])
 
 
+def _same(images: list[bytes]) -> bool:
+    return images[0] is images[1]
+
+
+def test_long_bytes_that_are_there_twice_are_sent_once(child: ComputeChild) -> None:
+    image = bytes(1_000_000)
+    assert child.call(_same, [image, image], deadline_s=30)
+    assert not child.call(_same, [image, bytes(bytearray(image))], deadline_s=30)
+
+
 def test_an_exception_keeps_its_message_and_traceback(child: ComputeChild) -> None:
     with pytest.raises(ComputeError, match="ValueError") as caught:
         child.call(int, "seven", deadline_s=30)

@@ -47,6 +47,7 @@ class _Backend:
         self._has_unsubmitted = False
         self._retry_at = 0.0
         self._solve_failures = 0
+        self._has_ended = False  # the final graph is in the ledger, though perhaps not yet back from there
 
     def serve(self) -> None:
         self._context.stopping.wakes(self._log.wake)
@@ -135,8 +136,7 @@ class _Backend:
     def _solve(self) -> bool:
         """Solve the graph if there is anything new to solve, or the final one when all is done; whether it did."""
         state = self._state
-        graph = state.latest_graph()
-        if graph is not None and graph.is_final:
+        if self._is_over():
             return False
         is_final = self._is_complete
         inputs = state.graph_input_count
@@ -157,7 +157,7 @@ class _Backend:
         self._solve_failures = 0
         self._pace.solved(inputs)
         try:
-            self._append(update)
+            self._has_ended = self._append(update) and is_final
         except RequestRefusedError as error:
             if is_final:
                 raise
@@ -165,11 +165,15 @@ class _Backend:
             _log.info("live graph not kept", extra={"reason": str(error)})
         return True
 
+    def _is_over(self) -> bool:
+        graph = self._state.latest_graph()
+        return self._has_ended or (graph is not None and graph.is_final)
+
     def _until_live_graph_s(self) -> float | None:
         """See :meth:`.live.LivePace.wait_s`; after the final graph, whatever still comes, none is due."""
-        graph = self._state.latest_graph()
-        if graph is not None and graph.is_final:
+        if self._is_over():
             return None
+        graph = self._state.latest_graph()
         if graph is not None:
             self._pace.solved(graph.revision)  # perhaps by a backend before this one
         return self._pace.wait_s(
@@ -208,15 +212,16 @@ class _Backend:
                 return update
             self._live.restart()
 
-    def _append(self, update: GraphUpdate) -> None:
+    def _append(self, update: GraphUpdate) -> bool:
+        """Append, for as long as it takes; False: told to stop before it was."""
         while True:
             try:
                 self._context.ledger.append(Stream.GRAPH, update.record_id, update)
-                return
+                return True
             except DiskFullError as error:
                 self._hold_up(f"graph not appended yet: {error}")
             if self._context.stopping.wait(_RETRY_S):
-                return
+                return False
 
     def _hold_up(self, reason: str) -> None:
         """Say why it does not go on, and wait a moment with the next attempt."""

@@ -39,7 +39,7 @@ class Announcement:
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
         self._thread.start()
 
-    def publish_now(self) -> None:
+    def publish_soon(self) -> None:
         """Send a report soon: a change of state should not wait a second."""
         self._changed.set()
 
@@ -56,8 +56,8 @@ class Announcement:
 
     def _run(self) -> None:
         while True:
+            self._changed.clear()  # before we look: what is set from now on is seen next time
             is_last = self._closing.is_set()
-            self._changed.clear()
             try:
                 self._publisher.put(codec.encode(self._health()))
             except BusError as error:

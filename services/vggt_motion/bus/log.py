@@ -86,6 +86,11 @@ class LogFollower:
                 records.append(followed.record)
         return records
 
+    def expect(self, ends: Mapping[str, int]) -> None:
+        """The ledger says that its streams have so many records each: what has not come is read at once."""
+        for name, follower in self._by_name.items():
+            follower.expect(ends.get(name, 0))
+
     def positions(self) -> dict[Stream, int]:
         """Of each stream, the sequence number of the record that is delivered next."""
         return {stream: follower.position for stream, follower in self.followers.items()}
@@ -129,5 +134,4 @@ class LogFollower:
             if self._on_status is not None:
                 self._on_status(status)
             if status is not None:
-                for name, follower in self._by_name.items():
-                    follower.expect(status.position(name))
+                self.expect({entry.stream: entry.next_sequence for entry in status.positions})

@@ -116,7 +116,7 @@ class ServiceContext:
         """
         has_changed = self._health.update(state, one_line(detail), counters)
         if has_changed and self._announcement is not None:
-            self._announcement.publish_now()
+            self._announcement.publish_soon()
 
     def set_counters(self, **counters: float) -> None:
         """Renew some counters; state and detail stay as they are. May be called from any thread."""

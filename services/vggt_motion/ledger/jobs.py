@@ -190,7 +190,7 @@ class JobQueue:
                     return None
                 has_lease, has_job = self._look(names, models, worker, claim_id)
                 is_held_back = has_job and not has_lease and not self._may_start()
-                if (has_lease or has_job) and not is_held_back:
+                if has_job and not is_held_back:
                     lease = self._take(names, models, worker, claim_id)
                     if lease is not None:
                         return lease
@@ -397,7 +397,7 @@ class JobQueue:
         return float("inf") if wake_s is None else wake_s
 
     def _look(self, kinds: Collection[str], models: Collection[str], worker: str, claim_id: str) -> tuple[bool, bool]:
-        """Whether a claim has its lease already, and whether there is a job for it; without a lock.
+        """Whether a claim has its lease already, and whether there is a job for it, leased or open; without a lock.
 
         Most find nothing, and a transaction costs an fsync.
         """

@@ -109,7 +109,7 @@ class _Recorder:
                 is_complete = self._is_complete
                 if time.monotonic() >= next_report or is_complete != was_complete:
                     next_report, was_complete = time.monotonic() + _REPORT_S, is_complete
-                    # a change of state is sent at once: whoever waits for the recording waits no longer than it takes
+                    # a change of state is sent soon: whoever waits for the recording waits hardly longer than it takes
                     self._report("idle" if is_complete else "working")
                 if count == 0:
                     follower.wait(_PATIENT_S if self._pending_keyframes else _REPORT_S)
