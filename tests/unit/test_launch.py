@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,6 +32,9 @@ class Follower:
             self._positions[stream] += len(batch)
             records += batch
         return records
+
+    def expect(self, ends: Mapping[str, int]) -> None:
+        self.expected = dict(ends)
 
     def positions(self) -> dict[Stream, int]:
         return self._positions
@@ -74,3 +77,4 @@ def test_a_run_is_over_when_it_has_taken_in_all_that_the_final_graph_speaks_of(
     state = run._follow(supervisor, SimpleNamespace(), watch, lambda progress: None)  # type: ignore[arg-type]
     assert sorted(state.submaps) == [(0, 1), (1, 1)]
     assert follower.positions()[Stream.SUBMAP] == 2
+    assert follower.expected == counts, "what is missing was asked for, and not waited for until the next poll"
