@@ -7,15 +7,12 @@ paid once, and ends with its parent, however the parent ends.
 
 from __future__ import annotations
 
-import io
 import logging
 import multiprocessing
 import multiprocessing.connection
 import os
-import pickle
 import select
 import signal
-import struct
 import threading
 import time
 import traceback
@@ -29,8 +26,6 @@ from vggt_motion.memory import keep_freed_memory
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.2
-_LARGE_BYTES = 32 * 2**10
-_COUNT = struct.Struct("<I")
 _context = multiprocessing.get_context("spawn")
 Result = TypeVar("Result")
 
@@ -106,7 +101,7 @@ class ComputeChild:
         """
         connection = self.start()
         end = time.monotonic() + deadline_s
-        self._guarded(lambda: _send(connection, (function, args)))
+        self._guarded(lambda: connection.send((function, args)))
         answer = select.poll()  # the connection's own makes a new selector each time
         answer.register(connection.fileno(), select.POLLIN)
         while not answer.poll(_POLL_S * 1000.0):
@@ -116,7 +111,7 @@ class ComputeChild:
             if time.monotonic() > end:
                 self.kill()
                 raise ComputeDeadlineError(f"took longer than {deadline_s:g} s and was ended")
-        outcome: Any = self._guarded(lambda: _receive(connection))
+        outcome: Any = self._guarded(connection.recv)
         if isinstance(outcome, _Failure):
             raise ComputeError(outcome.message, outcome.traceback_text)
         result: Result = outcome
@@ -164,50 +159,6 @@ def _describe(exit_code: int | None) -> str:
     return f"exit code {exit_code}"
 
 
-class _Pickler(pickle.Pickler):
-    """Leaves out what is long: images and depth are bytes, and need not be copied to be sent."""
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self.left_out: list[bytes] = []
-        self._numbers: dict[int, int] = {}  # by identity, as a pickle's own: what is there twice is sent once
-
-    def persistent_id(self, obj: Any) -> int | None:
-        if type(obj) is not bytes or len(obj) < _LARGE_BYTES:
-            return None
-        number = self._numbers.setdefault(id(obj), len(self.left_out))
-        if number == len(self.left_out):
-            self.left_out.append(obj)
-        return number
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, left_out: list[bytes]) -> None:
-        super().__init__(file)
-        self._left_out = left_out
-
-    def persistent_load(self, pid: int) -> bytes:
-        return self._left_out[pid]
-
-
-def _send(connection: Connection, content: Any) -> None:
-    """To the other one of our two processes: as ``Connection.send``, of what holds megabytes of bytes."""
-    file = io.BytesIO()
-    pickler = _Pickler(file)
-    pickler.dump(content)
-    connection.send_bytes(_COUNT.pack(len(pickler.left_out)) + file.getbuffer())
-    for part in pickler.left_out:
-        connection.send_bytes(part)
-
-
-def _receive(connection: Connection) -> Any:
-    """The inverse of :func:`_send`."""
-    file = io.BytesIO(connection.recv_bytes())
-    (count,) = _COUNT.unpack(file.read(_COUNT.size))
-    left_out = [connection.recv_bytes() for _ in range(count)]
-    return _Unpickler(file, left_out).load()
-
-
 def _serve(connection: Connection) -> None:
     keep_freed_memory()
     # Ctrl-C reaches the whole process group: the parent decides what it means.
@@ -215,7 +166,7 @@ def _serve(connection: Connection) -> None:
     threading.Thread(target=_die_with_parent, daemon=True).start()
     while True:
         try:
-            function, args = _receive(connection)
+            function, args = connection.recv()
         except (EOFError, OSError):
             return
         try:
@@ -224,7 +175,7 @@ def _serve(connection: Connection) -> None:
             text = " ".join(str(error).split()) or type(error).__name__
             message = text if isinstance(error, VggtMotionError) else f"{type(error).__name__}: {text}"
             outcome = _Failure(message, traceback.format_exc())
-        _send(connection, outcome)
+        connection.send(outcome)
 
 
 def _die_with_parent() -> None:

@@ -400,6 +400,11 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     watched = Watched(psutil.Process(process.pid))
     in_place = NumericsWatch(endpoint)
+
+    def counted() -> dict[str, float]:
+        """Numerics of those services that compute in their own process, since they began."""
+        return in_place.cpu_s | {"frontend": in_place.cpu_s.get("frontend", 0.0) + watched.decoding_s()}
+
     start_up: dict[str, float] = {}
     start_up_numerics: dict[str, float] = {}
     run_until_graph = 0.0
@@ -411,7 +416,7 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
             watched.look()
             is_sending = has_record(database, "event", "session_started")
             start_up = watched.by_name()
-            start_up_numerics = in_place.cpu_s | {"decoding": watched.decoding_s()}
+            start_up_numerics = counted()
         elif not is_solved:
             is_solved = has_record(database, "graph", "graph/final")
             # Whoever looks takes time and caches away from those that are looked at: seldom, where nobody ends.
@@ -427,12 +432,7 @@ def measure_share(folder: Path, source: str) -> dict[str, float]:
     assert process.returncode in (0, 3), f"the run ended with {process.returncode}"
     used = {name: seconds - start_up.get(name, 0.0) for name, seconds in watched.by_name().items()}
     numerics = {name: seconds for name, seconds in used.items() if name.endswith(" compute")}
-    since_start_up = {
-        name: seconds - start_up_numerics.get(name, 0.0)
-        for name, seconds in (in_place.cpu_s | {"decoding": watched.decoding_s()}).items()
-    }
-    since_start_up["frontend"] = since_start_up.get("frontend", 0.0) + since_start_up.pop("decoding")
-    numerics |= {name: seconds for name, seconds in since_start_up.items() if seconds > 0.0}
+    numerics |= {name: seconds - start_up_numerics.get(name, 0.0) for name, seconds in counted().items()}
     numerics["run"] = max(0.0, used["run"] - (run_until_graph - start_up.get("run", 0.0)))
     services = [name for name in used if not name.endswith(" compute")]
     row = {f"{name}_fabric_s": used[name] - numerics.get(name, 0.0) for name in services}

@@ -424,6 +424,7 @@ def test_our_settings_win_over_the_users_file(tmp_path: Path) -> None:
     assert merged.get_json("scouting/gossip/enabled") == "false"
     assert merged.get_json("transport/shared_memory/enabled") == "false"
     assert merged.get_json("transport/link/tx/lease") == "4000"
+    assert merged.get_json("transport/link/tx/keep_alive") == "2"
     assert merged.get_json("transport/auth/usrpwd/user") == '"u"'
     file.write_text("{no json5")
     with pytest.raises(ConfigurationError, match=r"zenoh\.json5: not accepted by Zenoh"):

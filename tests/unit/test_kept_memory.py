@@ -29,7 +29,7 @@ from vggt_motion.bus.service import resident_bytes
 from vggt_motion.memory import keep_freed_memory
 assert keep_freed_memory()
 before = resident_bytes()
-filled, meet = [], threading.Barrier(8)
+meet = threading.Barrier(8)
 def fill():
     kept = [b"x" * 1_000_000 for _ in range(40)]
     meet.wait()

@@ -1,8 +1,9 @@
 """The backend: follows the log, submits the jobs that it calls for, and solves the pose graph (DESIGN 3.6 and 4).
 
-While the run lasts, every new submap or constraint goes into the live graph, and what that then says is published: a
-live update holds all that the log held when it was begun. The final graph is a fresh batch over everything. All state
-is a fold of the log: killed and started again, the backend plans the same jobs and solves the same final graph.
+While the run lasts, every new submap or constraint goes into the live graph, at once or with registrations that are at
+work, and what that then says is published: a live update holds all that the log held when it was begun. The final graph
+is a fresh batch over everything. All state is a fold of the log: killed and started again, the backend plans the same
+jobs and solves the same final graph.
 """
 
 from __future__ import annotations

@@ -358,7 +358,7 @@ class Array(Rule):
         if len(values) != math.prod(self.shape):
             raise FieldError(f"has {len(values)} numbers, {math.prod(self.shape)} are needed")
         self._check(values)
-        return np.array(values).reshape(self.shape)
+        return np.array(values, dtype=np.float64).reshape(self.shape)
 
 
 class Plan:
@@ -396,7 +396,6 @@ class Plan:
         self.max_bytes = max_bytes
         self.full_name: str = message.DESCRIPTOR.full_name
         self._rules = tuple(rules.items())
-        self._takes = tuple((name, rule.take) for name, rule in self._rules)
         self._head = tuple((name, rule) for name, rule in self._rules if name != bulk)
         numbers = {entry.name: entry.number for entry in message.DESCRIPTOR.fields}
         self._tail = tuple((name, numbers[name], rule) for name, rule in self._rules if name == bulk)
@@ -416,21 +415,17 @@ class Plan:
 
     def read(self, message: Message, lifted: tuple[memoryview, ...] | None = None) -> Any:
         """Make the record of a message; ``lifted`` is what its bulk field held."""
-        lifted_name = None if lifted is None else self._tail[0][0]
         values = {}
-        name = ""
-        try:
-            for name, take in self._takes:
-                values[name] = take(message, name) if name != lifted_name else None
-            if lifted is not None:
-                name, _, rule = self._tail[0]
-                values[name] = rule.take_lifted(message, name, lifted)
-        except FieldError as error:
-            raise error.at(name) from None
+        for name, rule in self._rules:
+            try:
+                if lifted is not None and name == self._tail[0][0]:
+                    values[name] = rule.take_lifted(message, name, lifted)
+                else:
+                    values[name] = rule.take(message, name)
+            except FieldError as error:
+                raise error.at(name) from None
         record = self.record(**values)
-        problem = self._test(record)
-        if problem is not None:
-            raise FieldError(problem)
+        self._check(record)
         return record
 
     def parts(self, record: Any, cls: type[Part]) -> list[Part]:
