@@ -19,7 +19,11 @@ _ARENAS: Final = 2  # each thread would have its own, and keep as much
 
 
 def keep_freed_memory() -> bool:
-    """Have this process keep what it frees, twice 64 MiB at most; False: the C library has no such setting."""
+    """Have this process keep what it frees, 64 MiB at most at the end of each of two arenas.
+
+    What lies under a piece that is in use stays as well, as it does without the setting. False: the C library has no
+    such setting.
+    """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
