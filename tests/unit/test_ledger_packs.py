@@ -16,10 +16,15 @@ from hypothesis import strategies as st
 from ledger_helpers import damage_blob, in_pack, open_ledger, record
 from vggt_motion.direct import BLOCK_BYTES
 from vggt_motion.errors import DiskFullError, LedgerError
+from vggt_motion.ledger.check import check
 from vggt_motion.ledger.files import FileOperations
-from vggt_motion.ledger.log import set_content_aside
+from vggt_motion.ledger.log import Append, Appended, set_content_aside
 from vggt_motion.ledger.packs import PackFiles, read_place
 from vggt_motion.ledger.store import BlobEntry, DamagedBlobError, Place, UnknownError
+
+
+def entry_of(content: bytes) -> BlobEntry:
+    return BlobEntry(hashlib.sha256(content).hexdigest(), len(content))
 
 
 @given(batches=st.lists(st.lists(st.binary(max_size=300), max_size=6), max_size=6), max_bytes=st.integers(1, 500))
@@ -200,7 +205,7 @@ def test_a_part_of_the_disk_that_cannot_be_read_is_as_damaged_as_any(
 
 def test_a_known_record_whose_pack_is_gone_is_not_acknowledged_without_its_blob(tmp_path: Path) -> None:
     ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
-    entry = BlobEntry(hashlib.sha256(b"image").hexdigest(), 5)
+    entry = entry_of(b"image")
     ledger.store.append(record("keyframe", "a"), [b"image"], [entry])
     ledger.close()
     (tmp_path / "session" / "blobs" / "packs" / "00000001.pack").unlink()
@@ -212,9 +217,52 @@ def test_a_known_record_whose_pack_is_gone_is_not_acknowledged_without_its_blob(
     ledger.close()
 
 
+def test_records_that_are_new_in_all_look_at_nothing_before_their_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=1000)
+    reads = 0
+    read = ledger.rows.read
+
+    def counted(query: Any) -> Any:
+        nonlocal reads
+        reads += 1
+        return read(query)
+
+    monkeypatch.setattr(ledger.rows, "read", counted)
+    images = [b"one", b"two"]
+    together = [Append(record("keyframe", f"{n}"), [image], [entry_of(image)]) for n, image in enumerate(images)]
+    together.append(Append(record("keyframe", "2"), [b"one"], [entry_of(b"one")]))
+    assert [o.sequence for o in ledger.store.append_all(together) if isinstance(o, Appended)] == [0, 1, 2]
+    assert reads == 0
+    assert [ledger.store.blob(entry_of(image).sha256) for image in images] == images
+    ledger.close()
+    assert (tmp_path / "session" / "blobs" / "packs" / "00000001.pack").read_bytes() == in_pack(b"onetwo")
+    assert check(tmp_path / "session").is_sound
+
+
+def test_a_pack_that_finds_no_space_holds_up_only_what_brings_blobs(tmp_path: Path) -> None:
+    files = BrokenFiles()
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=1000, files=files)
+    together = [
+        Append(record("event", "before")),
+        Append(record("keyframe", "0"), [b"image"], [entry_of(b"image")]),
+        Append(record("event", "after")),
+    ]
+    files.step = "write"
+    outcomes = ledger.store.append_all(together)
+    assert [type(outcome) for outcome in outcomes] == [Appended, DiskFullError, Appended]
+    files.step = ""
+    assert [o.was_known for o in ledger.store.append_all(together) if isinstance(o, Appended)] == [True, False, True]
+    assert [row.record_id for row in ledger.store.read("event")] == ["before", "after"]
+    assert ledger.store.blob(entry_of(b"image").sha256) == b"image"
+    ledger.close()
+    assert check(tmp_path / "session").is_sound
+
+
 def test_setting_aside_what_was_damaged_leaves_what_has_come_back(tmp_path: Path) -> None:
     ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
-    entry = BlobEntry(hashlib.sha256(b"image").hexdigest(), 5)
+    entry = entry_of(b"image")
     ledger.store.append(record("keyframe", "a"), [b"image"], [entry])
     damage_blob(tmp_path / "session", entry.sha256, b"imagE")
     ledger.store.append(record("keyframe", "b"), [b"image"], [entry])

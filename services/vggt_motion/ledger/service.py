@@ -64,6 +64,8 @@ _HISTORY = 16
 _PUBLISHED_TOGETHER = 32
 _PUBLISHED_BYTES = 32 * 2**10
 _GATHER_S = 0.01  # acknowledgements go out first, and what comes together is read from the log together
+_CROWDED_GATHER_S = 0.05  # while so much comes that reading it apart would hold up the next acknowledgements
+_CROWD = 4
 _FEW_WAITERS = 32
 _CROWDED_WAIT_S = 1.0
 _VANISHED_GRACE_S = 0.2
@@ -274,19 +276,22 @@ class LogPublisher:
         self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
+        count = 0
         while not self._is_closed:
             self._wake.wait()
-            time.sleep(_GATHER_S)
+            time.sleep(_GATHER_S if count < _CROWD else _CROWDED_GATHER_S)
             self._wake.clear()
             try:
-                self._publish()
+                count = self._publish()
             except BusUnavailableError:
                 return  # the session is closed
             except LedgerError as error:
                 _log.error("the log cannot be read", extra={"reason": str(error)})
                 return  # the service ends for the same reason
 
-    def _publish(self) -> None:
+    def _publish(self) -> int:
+        """Publish what is new; returns how many records that were."""
+        published = 0
         for stream, end in self._store.positions().items():
             while self._cursors[stream] < end:
                 rows = self._store.read(stream, self._cursors[stream])
@@ -294,7 +299,9 @@ class LogPublisher:
                     count = _published_together(rows)
                     self._put(stream, [_entry(row) for row in rows[:count]])
                     self._cursors[stream] = rows[count - 1].sequence + 1
+                    published += count
                     rows = rows[count:]
+        return published
 
     def _put(self, stream: str, entries: Sequence[LogEntry]) -> None:
         try:
