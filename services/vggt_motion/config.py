@@ -143,7 +143,11 @@ class SpoolConfig(Section):
     """Where the frontend of a live camera keeps what the ledger has not acknowledged yet."""
 
     directory: Path | None = Field(None, description="folder; None = .vggt-motion/spool in the user's home")
-    max_bytes: int = Field(4 * 2**30, ge=0, description="when it is full, frames go by until there is room")
+    max_bytes: int = Field(
+        4 * 2**30,
+        ge=0,
+        description="when it, or its disk up to ledger.reserve_bytes, is full, frames go by",
+    )
 
 
 class SfmConfig(Section):

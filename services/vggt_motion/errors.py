@@ -77,7 +77,7 @@ class LedgerError(VggtMotionError):
 
 
 class DiskFullError(LedgerError):
-    """The ledger refuses new data until there is space again; nothing that was acknowledged is affected."""
+    """New data is refused until there is space on the disk again; nothing that was acknowledged is affected."""
 
 
 class PredictionError(VggtMotionError):

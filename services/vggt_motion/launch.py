@@ -339,6 +339,8 @@ class LocalRun:
                     has_all = ends is not None and _has_come(follower, ends)
                     if has_all and recorded.is_complete(state, follower.positions(), now):
                         break
+                    if recorded.waits_for_space():
+                        finished_at = now
                     if has_all and now - finished_at > _RECORDER_TIMEOUT_S:
                         _log.warning("the recorder did not catch up in time; the recording may lack its end")
                         break
@@ -411,6 +413,10 @@ class _RecorderProgress:
         self._is_enabled = is_enabled
         self._frame_count = -1.0
         self._quiet_since = 0.0
+
+    def waits_for_space(self) -> bool:
+        report = self._watch.newest_report("recorder")
+        return self._is_enabled and report is not None and report.state == "waiting"
 
     def is_complete(self, state: LogState, positions: Mapping[Stream, int], now: float) -> bool:
         if not self._is_enabled:

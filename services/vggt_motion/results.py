@@ -24,7 +24,8 @@ from vggt_motion.backend.session_map import build_session_map, main_component
 from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
 from vggt_motion.config import Config
-from vggt_motion.errors import InputError
+from vggt_motion.disk import NO_SPACE
+from vggt_motion.errors import DiskFullError, InputError
 from vggt_motion.evaluation import metrics as evaluation
 from vggt_motion.evaluation.report import write_report
 from vggt_motion.evaluation.report_data import (
@@ -98,6 +99,7 @@ def write_results(
 
     Raises:
         InputError: a file cannot be written.
+        DiskFullError: there is no space for it; may be repeated.
     """
     _catch_up(state, config)
     graph = state.latest_graph() or GraphUpdate(0, False, (), ())
@@ -149,7 +151,8 @@ def write_results(
         write_report(out, data)
         _write(out / METRICS_FILE, json.dumps(_finite(metrics), indent=2) + "\n")
     except OSError as error:
-        raise InputError(f"cannot write results to {out}: {error.strerror or error}") from error
+        kind = DiskFullError if error.errno in NO_SPACE else InputError
+        raise kind(f"cannot write results to {out}: {error.strerror or error}") from error
     return metrics
 
 

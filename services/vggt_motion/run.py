@@ -10,7 +10,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -27,6 +27,7 @@ from vggt_motion.ledger.directory import locked, stored_blob
 from vggt_motion.ledger.sessions import SessionState, prepare_session, remove_session
 from vggt_motion.records import BlobRef, Event, EventKind, JobReport, JobState, MotionState, Stream
 
+_Outcome = TypeVar("_Outcome")
 INTERRUPTED_EXIT_CODE = 130
 _DISK_RETRY_S = 1.0
 _INTERRUPTED_PATIENCE_S = 15.0
@@ -71,9 +72,12 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     metrics: dict[str, Any] = {}
 
     def finish(outcome: launch.RunOutcome, bus: Bus) -> None:
-        metrics.update(_write_results(request, run, outcome, bus, reference))
+        write = functools.partial(_write_results, request, run, outcome, bus, reference)
+        metrics.update(_with_space(write, bus, console, "Waiting to write the results"))
         if metrics["is_complete"]:
-            _append_run_ended(bus, console)
+            event = Event("run_ended", EventKind.RUN_ENDED, "the run ended by itself", time.time_ns())
+            append = functools.partial(LedgerClient(bus).append, Stream.EVENT, event.event_id, event)
+            _with_space(append, bus, console, "The results are written. Waiting to close the session")
 
     with _display(console, run.source_description) as on_progress:
         outcome = run.execute(on_progress, finish)
@@ -88,18 +92,16 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
     return outcome.exit_code
 
 
-def _append_run_ended(bus: Bus, console: Console) -> None:
-    """Close the session in its log; without space on the disk, as soon as there is some."""
-    event = Event("run_ended", EventKind.RUN_ENDED, "the run ended by itself", time.time_ns())
+def _with_space(work: Callable[[], _Outcome], bus: Bus, console: Console, what: str) -> _Outcome:
+    """What ``work`` returns; without space on the disk, as soon as there is some."""
     is_told = False
     while True:
         try:
-            LedgerClient(bus).append(Stream.EVENT, event.event_id, event)
-            return
+            return work()
         except DiskFullError as error:
             if not is_told:
                 is_told = True
-                console.print(f"The results are written. Waiting to close the session: {escape(str(error))}")
+                console.print(f"{what}: {escape(str(error))}")
             if bus.wait(_DISK_RETRY_S):
                 raise
 

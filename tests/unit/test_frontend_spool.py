@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from full_disk import full_disk
 from vggt_motion.errors import InputError
 from vggt_motion.frontend.spool import Spool
 
@@ -41,6 +42,25 @@ def test_it_is_bounded_and_a_long_request_passes_alone(tmp_path: Path) -> None:
     assert spool.put(bytes(20), 0.0) and spool.put(bytes(5), 0.0)
     assert not spool.put(b"x", 0.0)
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) == 25
+
+
+def test_on_a_full_disk_there_is_no_room_until_there_is_space(tmp_path: Path) -> None:
+    spool = Spool(tmp_path, 10**6)
+    assert spool.put(bytes(50), 0.0)
+    with full_disk(100):
+        assert not spool.put(bytes(200), 0.0)
+        assert spool.put(bytes(60), 0.0)
+    assert spool.put(bytes(200), 0.0)
+    assert [len(request) for request in drained(spool)] == [50, 60, 200]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_leaves_the_ledger_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vggt_motion.frontend.spool.free_space", lambda _: 1000)
+    spool = Spool(tmp_path, 10**6, reserve_bytes=900)
+    assert spool.put(bytes(500), 0.0), "one passes, or nothing would be sent any more"
+    assert not spool.put(bytes(101), 0.0)
+    assert spool.put(bytes(100), 0.0)
 
 
 def test_a_folder_that_cannot_be_used_is_one_line(tmp_path: Path) -> None:

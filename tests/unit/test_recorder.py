@@ -19,7 +19,8 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from vggt_motion.errors import InputError, SourceError, SourceTruncatedError
+from full_disk import full_disk
+from vggt_motion.errors import DiskFullError, InputError, SourceError, SourceTruncatedError
 from vggt_motion.foxglove import (
     MAP_FROM_WORLD,
     decode_image,
@@ -354,6 +355,61 @@ def test_source_needs_an_mcap_file_with_images(tmp_path: Path) -> None:
         Recording.open(text, chunk_bytes=CHUNK_BYTES)
     assert text.read_text() == "these are notes"
     assert list(tmp_path.glob("*.repair")) == []
+
+
+def write_frames(recording: Recording, indices: range) -> None:
+    for index in indices:
+        recording.add_frame(FrameId("front", 0, index), frame(index))
+
+
+def recorded_frames(path: Path) -> list[tuple[int, bytes]]:
+    scanner = McapScanner(path)
+    found = [(message.sequence, message.data) for message in scanner.messages() if "image" in message.channel.topic]
+    assert scanner.damage is None
+    scanner.close()
+    return found
+
+
+def test_on_a_full_disk_the_writer_waits_and_nothing_is_torn(tmp_path: Path) -> None:
+    undisturbed, path = tmp_path / "undisturbed.mcap", tmp_path / "run.mcap"
+    with Recording.open(undisturbed, chunk_bytes=3000) as recording:
+        write_frames(recording, range(40))
+    waits = 0
+
+    def wait_for_space(_: OSError) -> bool:
+        nonlocal waits
+        waits += 1
+        if waits == 3:
+            disk.has_space_again()
+        return True
+
+    with (
+        Recording.open(path, chunk_bytes=3000, wait_for_space=wait_for_space) as recording,
+        full_disk(undisturbed.stat().st_size // 2) as disk,
+    ):
+        write_frames(recording, range(40))
+    assert waits == 3
+    assert recorded_frames(path) == recorded_frames(undisturbed)
+
+
+def test_who_is_told_to_stop_on_a_full_disk_leaves_what_can_be_continued(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recording = Recording.open(path, chunk_bytes=3000)
+    write_frames(recording, range(20))
+    recording.flush()
+    with full_disk(path.stat().st_size + 1000):
+        with pytest.raises(OSError, match="File too large"):
+            write_frames(recording, range(20, 60))
+        recording.abandon()
+    torn = path.read_bytes()
+    with full_disk(2000), pytest.raises(DiskFullError, match="cannot write the recording"):
+        Recording.open(path, chunk_bytes=3000)
+    assert path.read_bytes() == torn
+    assert list(tmp_path.iterdir()) == [path]
+    with Recording.open(path, chunk_bytes=3000) as recording:
+        assert all(recording.has_frame("front", 0, index) for index in range(20))
+        write_frames(recording, range(60))
+    assert [index for index, _ in recorded_frames(path)] == list(range(60))
 
 
 def test_source_orders_by_number_and_selects(tmp_path: Path) -> None:

@@ -397,7 +397,11 @@ class _Outbox:
             if other.parent.name != status.ledger_id:
                 _log.warning("records for another ledger are left waiting", extra={"folder": str(other.parent)})
                 break
-        self._spool = Spool(folder / (status.ledger_id or "unknown"), context.config.spool.max_bytes)
+        self._spool = Spool(
+            folder / (status.ledger_id or "unknown"),
+            context.config.spool.max_bytes,
+            context.config.ledger.reserve_bytes,
+        )
         self._failure: VggtMotionError | None = None
         self._full_count = 0
         self._refused_count = 0
@@ -418,11 +422,11 @@ class _Outbox:
         while not self._spool.put(request, _SPOOL_POLL_S):
             self._check()
             if self._context.stopping.is_set():
-                raise BusUnavailableError("told to stop while the spool is full: the newest record is lost")
+                raise BusUnavailableError("told to stop while the spool or its disk is full: the newest record is lost")
             if not is_full:
                 is_full = True
                 self._full_count += 1
-            self._context.set_health("waiting", "the spool is full: frames go by", **self.counters())
+            self._context.set_health("waiting", "the spool or its disk is full: frames go by", **self.counters())
         self._check()
 
     def send_all(self) -> None:

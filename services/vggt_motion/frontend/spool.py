@@ -6,11 +6,13 @@ next one sends them first.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
 from pathlib import Path
 
+from vggt_motion.disk import NO_SPACE, free_space, sync_folder
 from vggt_motion.errors import InputError
 
 _SUFFIX = ".request"
@@ -19,18 +21,21 @@ _SUFFIX = ".request"
 class Spool:
     """A first-in, first-out queue of bytes in a folder, bounded in bytes. Thread-safe; one process at a time."""
 
-    def __init__(self, folder: Path, max_bytes: int) -> None:
+    def __init__(self, folder: Path, max_bytes: int, reserve_bytes: int = 0) -> None:
         """Take up what an earlier process left.
 
         Args:
             folder: created if it is not there.
             max_bytes: of all files together; a single longer request is taken when nothing else waits.
+            reserve_bytes: so much of the disk is left free, for the ledger may be on the same one; when nothing else
+                waits, a single request is taken all the same.
 
         Raises:
             InputError: the folder cannot be used.
         """
         self._folder = folder
         self._max_bytes = max_bytes
+        self._reserve_bytes = reserve_bytes
         self._changed = threading.Condition()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -55,7 +60,7 @@ class Spool:
             return sum(self._sizes.values())
 
     def put(self, request: bytes, timeout_s: float) -> bool:
-        """Add a request; False if there was no room in time.
+        """Add a request; False if there was no room in time, in the spool or on its disk.
 
         Raises:
             InputError: the folder cannot be written.
@@ -65,7 +70,9 @@ class Spool:
                 return False
             number = self._next
             # While the ledger answers, the page cache is enough against a kill; a backlog is kept through a power loss.
-            self._write(number, request, is_forced=bool(self._sizes))
+            if not self._write(number, request, is_forced=bool(self._sizes)):
+                self._changed.wait(timeout_s)
+                return False
             self._next = number + 1
             self._sizes[number] = len(request)
             self._changed.notify_all()
@@ -107,12 +114,19 @@ class Spool:
             return self._changed.wait_for(lambda: not self._sizes, timeout_s)
 
     def _has_room(self, size_bytes: int) -> bool:
-        return not self._sizes or sum(self._sizes.values()) + size_bytes <= self._max_bytes
+        if not self._sizes:
+            return True
+        if sum(self._sizes.values()) + size_bytes > self._max_bytes:
+            return False
+        with contextlib.suppress(OSError):  # then writing fails as well, and says why
+            return free_space(self._folder) - size_bytes >= self._reserve_bytes
+        return True
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:012d}{_SUFFIX}"
 
-    def _write(self, number: int, request: bytes, *, is_forced: bool) -> None:
+    def _write(self, number: int, request: bytes, *, is_forced: bool) -> bool:
+        """Whether there was space."""
         path = self._path(number)
         partial = path.with_suffix(".part")
         try:
@@ -122,6 +136,11 @@ class Spool:
                     file.flush()
                     os.fsync(file.fileno())
             partial.replace(path)
+            if is_forced:
+                sync_folder(self._folder)
+            return True
         except OSError as error:
             partial.unlink(missing_ok=True)
+            if error.errno in NO_SPACE:
+                return False
             raise InputError(f"cannot write to the spool {self._folder}: {error.strerror or error}") from error

@@ -16,8 +16,9 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from vggt_motion.disk import NO_SPACE, free_space
 from vggt_motion.errors import DiskFullError, LedgerError
-from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, free_space, make_folder
+from vggt_motion.ledger.files import FileOperations, SharedSync, make_folder
 from vggt_motion.ledger.store import (
     Blob,
     BlobEntry,

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
+from vggt_motion import disk
 from vggt_motion.direct import write_blocks
-
-NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of the errors by which a file system says that it is full."""
 
 
 class FileOperations:
@@ -43,11 +39,7 @@ class FileOperations:
 
     def sync_folder(self, folder: Path) -> None:
         """Force the entries of a folder to the disk."""
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        disk.sync_folder(folder)
 
 
 def make_folder(folder: Path, files: FileOperations) -> None:
@@ -56,12 +48,6 @@ def make_folder(folder: Path, files: FileOperations) -> None:
     for path in reversed(missing):
         path.mkdir(exist_ok=True)
         files.sync_folder(path.parent)
-
-
-def free_space(folder: Path) -> int:
-    """Bytes that an ordinary process may still write to the file system of ``folder``."""
-    stat = os.statvfs(folder)
-    return stat.f_bavail * stat.f_frsize
 
 
 class SharedSync:

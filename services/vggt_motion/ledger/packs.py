@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import Final
 
 from vggt_motion.direct import aligned_up, block_memory, open_direct, read_direct
+from vggt_motion.disk import NO_SPACE
 from vggt_motion.errors import DiskFullError, LedgerError
-from vggt_motion.ledger.files import NO_SPACE, FileOperations, SharedSync, make_folder
+from vggt_motion.ledger.files import FileOperations, SharedSync, make_folder
 from vggt_motion.ledger.store import Content, Place, Writing
 
 _LOGGER = logging.getLogger(__name__)

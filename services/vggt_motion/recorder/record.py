@@ -14,7 +14,7 @@ Lossless part, from which a session can be read back:
 Views: ``/pose``, ``/trajectory``, ``/map``, ``/tf`` (``recorder/views.py`` makes them).
 
 The file is flushed and synchronised by its owner at intervals; a file that was broken off is read up to its last whole
-chunk into a new file, which then takes its place and is continued.
+chunk into a new file, which then takes its place and is continued. On a full disk whoever writes waits for space.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
@@ -36,7 +37,8 @@ from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, IndexType, Writer
 
 from vggt_motion import __version__
-from vggt_motion.errors import CodecError, InputError, SourceError, VggtMotionError
+from vggt_motion.disk import NO_SPACE, PatientFile, sync_folder
+from vggt_motion.errors import CodecError, DiskFullError, InputError, SourceError, VggtMotionError
 from vggt_motion.foxglove import MAP_FRAME, MAP_FROM_WORLD, WORLD_FRAME, decode_image, encode_image, frame_transform
 from vggt_motion.recorder import schemas
 from vggt_motion.recorder.container import MAGIC, McapScanner, StoredMessage
@@ -90,9 +92,12 @@ class RecordingClosedError(VggtMotionError):
 class Recording:
     """One MCAP file being written. Safe to use from several threads."""
 
-    def __init__(self, path: Path, *, chunk_bytes: int, clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self, path: Path, *, chunk_bytes: int, wait_for_space: Callable[[OSError], bool], clock: Callable[[], int]
+    ) -> None:
         """Use :meth:`open`."""
         self.path = path
+        self._wait_for_space = wait_for_space
         self._clock = clock
         self._chunk_bytes = chunk_bytes
         self._lock = threading.RLock()
@@ -116,6 +121,7 @@ class Recording:
         *,
         chunk_bytes: int,
         on_entry: Callable[[str, int, bytes], None] | None = None,
+        wait_for_space: Callable[[OSError], bool] = lambda _: False,
         clock: Callable[[], int] = time.time_ns,
     ) -> Recording:
         """Begin a recording, or continue the one that is there, whole or broken off.
@@ -124,12 +130,14 @@ class Recording:
             path: the file.
             chunk_bytes: size at which a chunk is written.
             on_entry: called with (stream, sequence, payload) for each record of the log that is in the file already.
+            wait_for_space: called whenever the disk is full, by whoever writes, and waits a while; False: give up.
             clock: wall clock in nanoseconds, for the time of reception.
 
         Raises:
             InputError: there is a file of another kind, or none can be written there.
+            DiskFullError: there is no space; what was there is as it was.
         """
-        recording = cls(path, chunk_bytes=chunk_bytes, clock=clock)
+        recording = cls(path, chunk_bytes=chunk_bytes, wait_for_space=wait_for_space, clock=clock)
         try:
             if _has_content(path):
                 recording._continue(on_entry)
@@ -137,7 +145,8 @@ class Recording:
                 recording._begin(path)
                 recording._add_upright_frame()
         except OSError as error:
-            raise InputError(f"cannot write the recording {path}: {error.strerror or error}") from error
+            kind = DiskFullError if error.errno in NO_SPACE else InputError
+            raise kind(f"cannot write the recording {path}: {error.strerror or error}") from error
         return recording
 
     def __enter__(self) -> Recording:
@@ -326,7 +335,7 @@ class Recording:
                 self._file.close()
 
     def _begin(self, path: Path) -> None:
-        self._file = path.open("wb")
+        self._file = BufferedWriter(PatientFile(path, self._wait_for_space))
         # The library lists index groups in the summary even when they are empty, which other readers call an error:
         # so the indexes of attachments and metadata, which we never write, are off, and no file is without a message.
         self._writer = Writer(
@@ -339,7 +348,7 @@ class Recording:
         self._writer.start(profile="", library=f"vggt-motion {__version__}")
         self._writer.flush()  # type: ignore[no-untyped-call]
         os.fsync(self._file.fileno())
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
 
     def _add_upright_frame(self) -> None:
         self.add_transform(frame_transform(MAP_FROM_WORLD, MAP_FRAME, WORLD_FRAME, 0), 0)
@@ -358,13 +367,17 @@ class Recording:
             self.abandon()
             scratch.unlink()
             raise InputError(f"{self.path} is no recording of this program and is in the way of the new one") from error
+        except OSError:
+            self.abandon()
+            scratch.unlink(missing_ok=True)
+            raise
         finally:
             scanner.close()
         if not self._channels:
             self._add_upright_frame()
         self.flush()
         scratch.replace(self.path)
-        _sync_folder(self.path.parent)
+        sync_folder(self.path.parent)
         if scanner.damage is not None:
             _log.warning("%s was broken off (%s): continued from its last whole chunk", self.path, scanner.damage)
 
@@ -468,11 +481,3 @@ def _has_content(path: Path) -> bool:
     except FileNotFoundError:
         return False
     return not MAGIC.startswith(head)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

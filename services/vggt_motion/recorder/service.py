@@ -2,7 +2,8 @@
 
 What the file holds is decided by the file alone: after a restart, streams go on at the record that it lacks, and no
 frame is written twice. Frames that only went by while no recorder was there are taken from the ledger where they are
-keyframes; the others are counted as missing.
+keyframes; the others are counted as missing. On a full disk the recorder waits, and with it whoever publishes frames
+blocking.
 """
 
 from __future__ import annotations
@@ -58,6 +59,7 @@ _BLOB_PATIENCE_S = 2.0
 _VIEW_REST = 9.0  # after making views, rest for so many times as long: they may not cost more than a share of a core
 _VIEW_IDLE_S = 5.0
 _HELD_BYTES = 64 * 2**20
+_DISK_RETRY_S = 1.0
 
 
 def main(config: Config, *, directory: Path) -> int:
@@ -69,9 +71,21 @@ def main(config: Config, *, directory: Path) -> int:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"cannot write to {directory}: {error.strerror or error}") from error
-        _Recorder(context, directory / RECORDING_FILE).serve()
+        recorder = _opened(context, directory / RECORDING_FILE)
+        if recorder is not None:
+            recorder.serve()
 
     return run_service("recorder", config, body)
+
+
+def _opened(context: ServiceContext, path: Path) -> _Recorder | None:
+    while not context.stopping.is_set():
+        try:
+            return _Recorder(context, path)
+        except DiskFullError as error:
+            context.set_health("waiting", str(error))
+            context.stopping.wait(_DISK_RETRY_S)
+    return None
 
 
 class _Recorder:
@@ -80,7 +94,10 @@ class _Recorder:
         self._path = path
         self._log = LogState()
         self._recording = Recording.open(
-            path, chunk_bytes=context.config.recorder.chunk_bytes, on_entry=self._remember_entry
+            path,
+            chunk_bytes=context.config.recorder.chunk_bytes,
+            on_entry=self._remember_entry,
+            wait_for_space=self._wait_for_space,
         )
         self._payloads = RecentPayloads(_HELD_BYTES)
         self._views = _ViewThread(context, self._recording, self._payloads)
@@ -131,6 +148,10 @@ class _Recorder:
             self._recording.abandon()
             raise DiskFullError(f"cannot write {self._path}: {self._failure.strerror}") from self._failure
         self._report("ended")
+
+    def _wait_for_space(self, error: OSError) -> bool:
+        self._context.set_health("waiting", f"cannot write {self._path}: {error.strerror}")
+        return not self._context.stopping.wait(_DISK_RETRY_S)
 
     # --- what the file says already ---
 
