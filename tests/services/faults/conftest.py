@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fault_run import SMALL_SUBMAPS, FaultRun, Outcome, Snapshot
+from fault_run import HERE, SMALL_SUBMAPS, FaultRun, Outcome, Snapshot, with_hook
 
 from bus_processes import free_port
 
@@ -72,6 +72,7 @@ def judge(request: pytest.FixtureRequest) -> Callable[[str, Outcome], Outcome]:
     def enter(fault: str, outcome: Outcome) -> Outcome:
         request.config.stash[_TABLE][fault].append(outcome)
         print(f"{fault}: {outcome.seconds:.0f} s, {dict(outcome.injected)}")
+        assert outcome.acknowledged > 0, "nobody witnessed anything"
         assert not outcome.problems, (outcome.problems, outcome.output[-3000:])
         assert not outcome.differences, (outcome.differences, outcome.output[-3000:])
         assert (outcome.records_lost, outcome.records_twice, outcome.jobs_lost) == (0, 0, 0)
@@ -127,7 +128,11 @@ def start(fault_sample: Path, small_reference: tuple[Path, Snapshot], tmp_path: 
     runs: list[FaultRun] = []
     folder, reference = small_reference
 
-    def begin(*assignments: str, seconds_per_submap: float = 0.5, **options: Any) -> FaultRun:
+    def begin(
+        *assignments: str, seconds_per_submap: float = 0.5, seconds_per_frame: float = 0.0, **options: Any
+    ) -> FaultRun:
+        if seconds_per_frame:
+            options["environment"] = with_hook(HERE / "pace", PACE_S_PER_FRAME=str(seconds_per_frame))
         run = FaultRun(
             source=options.pop("source", fault_sample),
             out=options.pop("out", tmp_path / f"run{len(runs)}"),

@@ -30,6 +30,11 @@ class CuttingProxy:
     def endpoint(self) -> str:
         return f"tcp/127.0.0.1:{self.port}"
 
+    @property
+    def link_count(self) -> int:
+        """Links that are up at this moment."""
+        return len(self._peers) // 2
+
     def cut(self, seconds: float) -> None:
         """Every link is reset, and new ones are refused, for so long."""
         self.cut_count += 1

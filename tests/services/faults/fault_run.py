@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import random
+import secrets
 import signal
 import subprocess
 import sys
@@ -36,6 +37,12 @@ TOLERANCE = 1e-9
 RUN_TIMEOUT_S = 400.0
 SMALL_SUBMAPS = ("frontend.max_keyframes=4", "frontend.overlap_keyframes=2")
 """The sample in eight submaps instead of three: more to lose, less time each."""
+
+
+def with_hook(folder: Path, **variables: str) -> dict[str, str]:
+    """Environment of processes that import ``sitecustomize`` from a folder before anything else."""
+    return {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]), **variables}
+
 
 # Leases and heartbeats as short as a busy machine allows, so that a frozen process is noticed within the test.
 QUICK = ("bus.lease_s=2", "ledger.lease_duration_s=3", "bus.request_timeout_s=5", "gateway.port=0")
@@ -330,9 +337,11 @@ class Witness:
         try:
             self._bus = open_bus(self._config, stopping=self._stopping)
             ledger = LedgerClient(self._bus)
+            # of its own: a run that is continued has another witness, who must not bring back what was lost
+            name = f"witness/{secrets.token_hex(4)}"
             number = 0
             while not self._stopping.wait(self._interval_s):
-                event = Event(f"witness/{number:06d}", EventKind.WARNING, f"witness {number}", time.time_ns())
+                event = Event(f"{name}/{number:06d}", EventKind.WARNING, f"witness {number}", time.time_ns())
                 with contextlib.suppress(DiskFullError):
                     ledger.append(Stream.EVENT, event.event_id, event)
                     self.acknowledged.append(event.event_id)
