@@ -419,24 +419,36 @@ def notes(operations: Sequence[Operation]) -> Iterator[str]:
             yield operation.data.decode()
 
 
-def workload(folder: Path, log: DiskLog, *, syncs: bool) -> None:
-    """Appends, blobs of both kinds, jobs and checkpoints; every acknowledgement is noted with its blob."""
+def workload(folder: Path, log: DiskLog, *, without: str = "") -> None:
+    """Appends, blobs of every kind, jobs and checkpoints; every acknowledgement is noted with its blobs.
+
+    Without the syncs of "rows" or "packs" it is no durable ledger any more.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from ledger_helpers import open_ledger, predict, record
+    from vggt_motion.ledger.files import FileOperations
     from vggt_motion.ledger.store import Blob
     from vggt_motion.records import JobKind
 
+    class WithoutSyncs(FileOperations):
+        def sync_data(self, path: Path, descriptor: int) -> None:
+            pass
+
     generator = random.Random(1)
-    ledger = open_ledger(folder, packed_blob_bytes=3000, inline_bytes=600)
-    for statement in ("PRAGMA wal_autocheckpoint = 12", *(() if syncs else ("PRAGMA synchronous = OFF",))):
+    files = WithoutSyncs() if without == "packs" else FileOperations()
+    ledger = open_ledger(folder, packed_blob_bytes=3000, inline_bytes=600, files=files)
+    for statement in (
+        "PRAGMA wal_autocheckpoint = 12",
+        *(("PRAGMA synchronous = OFF",) if without == "rows" else ()),
+    ):
         ledger.rows._writer.execute(statement)
     ledger.rows.read(lambda reader: reader.positions())
 
     def append(number: int) -> None:
-        data = [
-            Blob.of(random.Random(number).randbytes(size)) for size in ((), (100,), (2500, 4000), (9000,))[number % 4]
-        ]
+        # none, among the rows, in a pack, in a pack and a file, in a file
+        sizes = ((), (100,), (2500, 2000), (2500, 4000), (9000,))[number % 5]
+        data = [Blob.of(random.Random(100 * number + size).randbytes(size)) for size in sizes]
         entries = [blob.entry for blob in data]
         ledger.store.append(record("keyframe", f"k{number}", b"%d" % number * 50), data, entries)
         log.note(" ".join(("keyframe", f"k{number}", *(entry.sha256 for entry in entries))))
@@ -461,7 +473,7 @@ def _main() -> None:
     folder.mkdir(parents=True)
     log = DiskLog(folder, file=file)
     log.install()
-    workload(folder, log, syncs="--without-syncs" not in sys.argv)
+    workload(folder, log, without=sys.argv[3] if len(sys.argv) > 3 else "")
 
 
 if __name__ == "__main__":

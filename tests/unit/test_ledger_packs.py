@@ -260,6 +260,20 @@ def test_a_pack_that_finds_no_space_holds_up_only_what_brings_blobs(tmp_path: Pa
     assert check(tmp_path / "session").is_sound
 
 
+def test_a_pack_that_cannot_be_forced_to_the_disk_acknowledges_nobody(tmp_path: Path) -> None:
+    files = BrokenFiles()
+    ledger = open_ledger(tmp_path / "session", packed_blob_bytes=1000, files=files)
+    files.step = "sync"
+    together = [
+        Append(record("event", "before")),
+        Append(record("keyframe", "0"), [b"image"], [entry_of(b"image")]),
+    ]
+    outcomes = ledger.store.append_all(together)
+    assert [type(outcome) for outcome in outcomes] == [LedgerError, LedgerError]
+    assert ledger.store.positions() == {}
+    ledger.close()
+
+
 def test_setting_aside_what_was_damaged_leaves_what_has_come_back(tmp_path: Path) -> None:
     ledger = open_ledger(tmp_path / "session", packed_blob_bytes=100)
     entry = entry_of(b"image")

@@ -77,9 +77,10 @@ def test_every_acknowledged_record_survives_a_power_cut_at_any_operation(tmp_pat
     assert damaged > IMAGES, "the power was never lost in the middle of anything"
 
 
-def test_the_model_notices_missing_syncs(tmp_path: Path) -> None:
-    """Guards the test above: without the syncs of the rows some image must lack what was acknowledged."""
-    operations = operations_of(tmp_path, "--without-syncs")
+@pytest.mark.parametrize("of", ["rows", "packs"])
+def test_the_model_notices_missing_syncs(of: str, tmp_path: Path) -> None:
+    """Guards the test above: without these some image must lack what was acknowledged."""
+    operations = operations_of(tmp_path, of)
     generator = random.Random(7)
     ends = [number + 1 for number, operation in enumerate(operations) if operation.kind == "note"][10:20]
     lost = []

@@ -112,8 +112,15 @@ class BlobFiles:
             return False
 
     def free_bytes(self) -> int:
-        """Space left in bytes."""
-        return self._free_bytes()
+        """Space left in bytes.
+
+        Raises:
+            LedgerError: the file system does not say.
+        """
+        try:
+            return self._free_bytes()
+        except OSError as error:
+            raise LedgerError(f"cannot tell the free space of {self._folder}: {error.strerror or error}") from error
 
     def names(self) -> Iterator[str]:
         """SHA-256 of every stored file, in order, whether a record refers to it or not."""

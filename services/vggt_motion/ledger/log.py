@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vggt_motion.errors import DiskFullError, VggtMotionError
+from vggt_motion.errors import DiskFullError, RequestRefusedError, VggtMotionError
 from vggt_motion.ledger.recent import RecentBlobs
 from vggt_motion.ledger.store import (
     Blob,
@@ -230,7 +230,10 @@ class Store:
         Returns:
             For each, in order, its acknowledgement or what :meth:`append` would have raised.
         """
-        free_bytes = self._blobs.free_bytes()
+        try:
+            free_bytes = self._blobs.free_bytes()
+        except VggtMotionError as error:
+            return [error] * len(wanted)
         outcomes = self._appended_as_new(wanted, free_bytes) or self._append_after_a_look(wanted, free_bytes)
         for index, outcome in outcomes.items():
             if isinstance(outcome, Appended):
@@ -241,7 +244,7 @@ class Store:
         """Append records that are all new and bring what they refer to: most do, and nothing is read twice.
 
         Returns:
-            Nothing where one is not, or something is in the way: then nothing was changed.
+            Nothing where one is not, or may not be added: then nothing was changed.
         """
         brought = [{blob.entry: blob.data for blob in map(Blob.of, entry.blobs)} for entry in wanted]
         new = {entry: data for blobs in brought for entry, data in blobs.items()}
@@ -271,9 +274,12 @@ class Store:
             placing.wait()
             return appended
 
-        with contextlib.suppress(VggtMotionError, _NotNewError):
+        try:
             return dict(enumerate(self._rows.write(add_all)))
-        return {}
+        except (DiskFullError, RequestRefusedError, _NotNewError):
+            return {}  # which of them, a second look finds out
+        except VggtMotionError as error:
+            return dict.fromkeys(range(len(wanted)), error)
 
     def _begin(self, new: dict[BlobEntry, Content]) -> _Placing:
         """Give contents their places: among the rows, or in a pack, to which they are on their way then."""

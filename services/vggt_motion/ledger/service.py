@@ -172,8 +172,9 @@ def _watch(context: ServiceContext, ledger: Ledger, desk: Desk, presence: Presen
     next_health_s = 0.0
     tick_s = min(_TICK_S, context.config.ledger.lease_duration_s / _TICKS_PER_LEASE)
     while not context.stopping.wait(tick_s):
-        if desk.failure is not None:
-            raise desk.failure
+        failure = desk.failure or publisher.failure
+        if failure is not None:
+            raise failure
         is_connected = context.bus.is_connected
         try:
             gone = presence.take_vanished(is_connected=is_connected)
@@ -262,6 +263,7 @@ class LogPublisher:
         }
         self._wake = threading.Event()
         self._is_closed = False
+        self.failure: LedgerError | None = None
         self._thread = threading.Thread(target=self._run, name="publish the log", daemon=True)
         self._thread.start()
 
@@ -270,24 +272,27 @@ class LogPublisher:
         self._wake.set()
 
     def close(self) -> None:
-        """Publish what is durable, and end."""
+        """Publish what is durable by now, and end."""
         self._is_closed = True
         self._wake.set()
         self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
         count = 0
-        while not self._is_closed:
+        is_last = False
+        while not is_last:
             self._wake.wait()
-            time.sleep(_GATHER_S if count < _CROWD else _CROWDED_GATHER_S)
+            is_last = self._is_closed
+            if not is_last:
+                time.sleep(_GATHER_S if count < _CROWD else _CROWDED_GATHER_S)
             self._wake.clear()
             try:
                 count = self._publish()
             except BusUnavailableError:
                 return  # the session is closed
             except LedgerError as error:
-                _log.error("the log cannot be read", extra={"reason": str(error)})
-                return  # the service ends for the same reason
+                self.failure = error
+                return
 
     def _publish(self) -> int:
         """Publish what is new; returns how many records that were."""

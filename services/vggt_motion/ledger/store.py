@@ -257,7 +257,7 @@ class Rows(Protocol):
         """Carry out one change atomically; durable on return. An exception of ``change`` undoes it and is passed on.
 
         Changes of several threads may be committed together, and a change may be run again when it could not be
-        serialised: it must not have effects of its own.
+        serialised: it must not have effects of its own, but for contents in packs, to which nobody refers then.
 
         Raises:
             DiskFullError: there is no space; nothing was changed.
