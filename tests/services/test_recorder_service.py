@@ -195,15 +195,28 @@ def test_what_is_no_image_is_refused_and_counted(tmp_path: Path, session: Sessio
         publisher = camera(live)
         publisher.put(b"\xff\xff\xff")
         publisher.put(encode_image(frame(session, 0), "front"), attachment=b"\xff\xff")
+        real = frame(session, 1)
+        size_at = real.encoded.index(b"\xff\xc0") + 5
+        bomb = real.encoded[:size_at] + b"\x7d\x00\x7d\x00" + real.encoded[size_at + 4 :]
+        for encoded, media_type in (
+            (real.encoded[:-40], "image/jpeg"),
+            (b"GIF89a" + bytes(100), "image/jpeg"),
+            (session.image, "image/jpeg"),
+            (bomb, "image/jpeg"),
+        ):
+            # under the number of a frame that comes after them
+            payload = encode_image(Frame(1, real.capture_time_ns, encoded, media_type), "front")
+            publisher.put(payload, attachment=ImageHeader(0, 1).encode())
         publish(publisher, session, range(3))
 
         def has_all() -> bool:
             report = live.report_of(recorder)
-            return report is not None and (report.counters["frames"], report.counters["refused_images"]) == (3, 2)
+            return report is not None and (report.counters["frames"], report.counters["refused_images"]) == (3, 6)
 
-        wait_for(has_all, "three frames and two refusals")
+        wait_for(has_all, "three frames and six refusals")
         assert recorder.stop() == 0
-    assert len(list(McapSource(tmp_path / "run.mcap", Selection()).frames())) == 3
+    frames = list(McapSource(tmp_path / "run.mcap", Selection()).frames())
+    assert frames == [frame(session, index) for index in range(3)]
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_line(tmp_path: Path) -> None:

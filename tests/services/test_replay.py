@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 from bus_processes import bus_config, free_port, running, wait_until_heard
-from vggt_motion.bus.images import encode_image
+from vggt_motion.bus.images import ImageHeader, encode_image
 from vggt_motion.bus.session import open_bus
 from vggt_motion.config import Config
 from vggt_motion.errors import InputError, SourceError
@@ -174,6 +176,23 @@ def test_frames_of_a_bridge_the_newest_win(config: Config) -> None:
     assert first.encoded == frame(0).encoded
     assert [f.encoded for f in rest] == [frame(index).encoded for index in range(COUNT - 8, COUNT)]
     assert source.dropped_count == COUNT - 1 - 8
+
+
+def test_what_is_too_large_or_cut_off_is_refused_and_its_number_stays_free(config: Config) -> None:
+    source = ZenohSource(config.bus, "front", Selection())
+    source.join()
+    with open_bus(config.bus) as bus:
+        publisher = bus.publisher(bus.keys.image("front"), blocking=True)
+        wait_until_heard(bus, bus.keys.image("front"))
+        whole = frame(0)
+        bomb = whole.encoded[:16] + struct.pack(">II", 32_000, 32_000) + whole.encoded[24:]
+        padded = whole.encoded + bytes(130_000_000 + 2**23)
+        for encoded in (bomb, padded, whole.encoded[:-20], whole.encoded):
+            payload = encode_image(replace(whole, encoded=encoded), "front")
+            publisher.put(payload, attachment=ImageHeader(0, 0).encode())
+        assert next(source.frames()) == whole
+        source.close()
+    assert source.refused_count == 3
 
 
 def test_no_camera_is_one_clear_error(config: Config) -> None:

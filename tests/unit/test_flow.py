@@ -123,8 +123,12 @@ def test_unreadable_first_frame() -> None:
 def test_unreadable_later_frame_and_size_change_are_truncations_that_name_the_frame() -> None:
     decoder = GreyDecoder(320)
     decoder.decode(encode(textured(100, 320)))
-    with pytest.raises(SourceTruncatedError, match="frame 7 is not a readable image"):
+    with pytest.raises(SourceTruncatedError, match="frame 7 is not a whole JPEG or PNG image; the 7 frames before"):
         decoder.decode(Frame(7, 0, b"hello", "image/png"))
+    damaged = bytearray(encode(textured(100, 320)).encoded)
+    damaged[len(damaged) // 2] ^= 1
+    with pytest.raises(SourceTruncatedError, match="frame 8 is not a readable image; the 8 frames before"):
+        decoder.decode(Frame(8, 0, bytes(damaged), "image/png"))
     with pytest.raises(SourceTruncatedError, match="frame 9 is 320x90, the frames before it are 320x100"):
         decoder.decode(encode(textured(90, 320), index=9))
 

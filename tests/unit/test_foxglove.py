@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -14,6 +15,7 @@ from vggt_motion.bus.images import ImageHeader, decode_image, encode_image
 from vggt_motion.errors import CodecError
 from vggt_motion.sources.source import Frame
 
+PICTURE = bytes(cv2.imencode(".png", np.zeros((4, 6), np.uint8))[1])
 TIMES_NS = st.integers(0, 2**63 - 1)
 
 
@@ -32,9 +34,9 @@ def test_the_header_travels_beside_the_image(
     index: int, epoch: int, is_last: bool, is_accepted: bool, time_ns: int
 ) -> None:
     header = ImageHeader(epoch, index, is_last, is_accepted)
-    image = decode_image(encode_image(Frame(index, time_ns, b"x", "image/png"), "front"), header.encode())
-    assert image.header == header
-    assert decode_image(encode_image(Frame(index, time_ns, b"x", "image/png"), "front")).header is None
+    payload = encode_image(Frame(index, time_ns, PICTURE, "image/png"), "front")
+    assert decode_image(payload, header.encode()).header == header
+    assert decode_image(payload).header is None
 
 
 @given(st.binary(max_size=300), st.binary(max_size=60))
@@ -68,13 +70,33 @@ def test_impossible_images_are_named(message: CompressedImage, reason: str) -> N
 
 
 def test_headers_of_another_schema_and_numbers_too_large_are_refused() -> None:
-    payload = foxglove.encode_image(b"x", "image/png", 0, "front")
+    payload = foxglove.encode_image(PICTURE, "image/png", 0, "front")
     with pytest.raises(CodecError, match="schema 0"):
         decode_image(payload, b"\x18\x05")  # a frame index without a schema version
     with pytest.raises(CodecError, match="schema 2, known is 1"):
         decode_image(payload, b"\x08\x02")
     with pytest.raises(CodecError, match="out of range"):
         decode_image(payload, ImageHeader(0, 2**32).encode())
+
+
+@pytest.mark.parametrize(
+    ("encoded", "media_type", "reason"),
+    [
+        (PICTURE[:-9], "image/png", "not a whole JPEG or PNG image"),
+        (b"a foreign image", "image/jpeg", "not a whole JPEG or PNG image"),
+        (PICTURE, "image/jpeg", "the image is image/png, its message says image/jpeg"),
+        (PICTURE[:16] + b"\x00\x00\x7d\x00" * 2 + PICTURE[24:], "image/png", "32000x32000 pixels"),
+        (PICTURE + bytes(200), "image/png", f"an image of {len(PICTURE) + 200} bytes"),
+    ],
+    ids=["cut off", "foreign", "of another type", "too many pixels", "too many bytes"],
+)
+def test_what_may_not_be_a_frame_is_refused_on_the_image_key(
+    monkeypatch: pytest.MonkeyPatch, encoded: bytes, media_type: str, reason: str
+) -> None:
+    monkeypatch.setattr("vggt_motion.sources.encoded.MAX_BYTES", len(PICTURE) + 100)
+    payload = foxglove.encode_image(encoded, media_type, 0, "front")
+    with pytest.raises(CodecError, match=reason):
+        decode_image(payload, ImageHeader(0, 5).encode())
 
 
 def test_what_cannot_be_recorded_is_refused() -> None:

@@ -12,6 +12,7 @@ from google.protobuf.message import DecodeError
 
 from vggt_motion import foxglove
 from vggt_motion.errors import CodecError
+from vggt_motion.sources.encoded import checked_media_type
 from vggt_motion.sources.source import Frame
 from vggt_motion.v1 import recording_pb2
 
@@ -58,12 +59,16 @@ def encode_image(frame: Frame, camera: str) -> bytes:
 
 
 def decode_image(payload: bytes, attachment: bytes = b"") -> ReceivedImage:
-    """Read a message of the image key.
+    """Read a message of the image key. Whoever reads them takes the same: what the frontend refuses is not recorded.
 
     Raises:
-        CodecError: payload or attachment is malformed or of a newer schema.
+        CodecError: payload or attachment is malformed or of a newer schema, or the image is not a whole one of the
+            type that the message gives, or too large.
     """
     encoded, media_type, time_ns = foxglove.decode_image(payload)
+    found = checked_media_type(encoded)
+    if found != media_type:
+        raise CodecError(f"the image is {found}, its message says {media_type}")
     return ReceivedImage(encoded, media_type, time_ns, _decode_header(attachment) if attachment else None)
 
 

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vggt_motion.errors import SourceError, SourceTruncatedError
+from vggt_motion.errors import CodecError, SourceError, SourceTruncatedError
+from vggt_motion.sources.encoded import checked_media_type
 from vggt_motion.sources.source import Frame
 
 Grey = npt.NDArray[np.uint8]
@@ -60,16 +61,16 @@ class GreyDecoder:
         """Decode a frame and reduce it to the working width.
 
         Raises:
-            SourceError: the very first frame is not readable.
-            SourceTruncatedError: a later frame is not readable or has another size; the message names it.
+            SourceError: the very first frame is not readable or too large.
+            SourceTruncatedError: a later frame is not readable, too large or has another size; the message names it.
         """
-        full = _decode_grey(frame.encoded)
-        if full is None:
+        try:
+            full = _decode_grey(frame.encoded)
+        except CodecError as error:
+            message = f"frame {frame.index} is {error}"
             if self._size is None:
-                raise SourceError(f"frame {frame.index} is not a readable image")
-            raise SourceTruncatedError(
-                f"frame {frame.index} is not a readable image; the {frame.index} frames before it are used"
-            )
+                raise SourceError(message) from error
+            raise SourceTruncatedError(f"{message}; the {frame.index} frames before it are used") from error
         height, width = full.shape
         if self._size is None:
             self._size = (width, height)
@@ -81,14 +82,15 @@ class GreyDecoder:
         return GreyFrame(resize_grey(full, self._flow_width_px), width, height)
 
 
-def _decode_grey(encoded: bytes) -> Grey | None:
-    if not encoded:
-        return None
+def _decode_grey(encoded: bytes) -> Grey:
+    checked_media_type(encoded)
     try:
         pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error:
-        return None
-    return None if pixels is None else np.asarray(pixels, np.uint8)
+        pixels = None
+    if pixels is None:
+        raise CodecError("not a readable image")
+    return np.asarray(pixels, np.uint8)
 
 
 def resize_grey(full: Grey, width_px: int) -> Grey:

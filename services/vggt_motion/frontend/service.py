@@ -114,7 +114,9 @@ class EgoMask:
             content = path.read_bytes()
         except OSError as error:
             raise InputError(f"cannot read ego mask {path}: {error.strerror or error}") from error
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
+        pixels = None
+        with contextlib.suppress(cv2.error):  # empty, or larger than OpenCV may decode
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
         if pixels is None:
             raise InputError(f"ego mask {path} is not a readable image")
         self.pixels: npt.NDArray[np.uint8] = np.asarray(pixels, np.uint8)  # (H, W), non-zero = never to be used

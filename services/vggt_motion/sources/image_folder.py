@@ -8,8 +8,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from vggt_motion.errors import SourceError, SourceTruncatedError
-from vggt_motion.sources.encoded import PNG, media_type_of, transcode_to_png
+from vggt_motion.errors import CodecError, SourceError, SourceTruncatedError
+from vggt_motion.sources.encoded import checked_media_type, is_jpeg_or_png, transcode_to_png
 from vggt_motion.sources.selection import Selection
 from vggt_motion.sources.source import Frame
 from vggt_motion.sources.timing import NANOSECONDS, TimestampRepair, median_interval_ns, read_times
@@ -98,13 +98,12 @@ def _read(path: Path) -> tuple[bytes, str]:
         encoded = path.read_bytes()
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
-    media_type = media_type_of(encoded)
-    if media_type is not None:
-        return encoded, media_type
-    png = transcode_to_png(encoded)
-    if png is None:
-        raise SourceError(f"{path} is not a readable image")
-    return png, PNG
+    try:
+        if not is_jpeg_or_png(encoded):
+            encoded = transcode_to_png(encoded)
+        return encoded, checked_media_type(encoded)
+    except CodecError as error:
+        raise SourceError(f"{path} is {error}") from error
 
 
 def _times(path: Path | None, image_count: int, nominal_ns: int) -> list[int]:

@@ -23,7 +23,7 @@ from vggt_motion.recorder import schemas
 from vggt_motion.recorder.container import Location, McapScanner, StoredMessage
 from vggt_motion.recorder.record import CAMERA, EPOCH, LOG_TOPIC, NUMBERED
 from vggt_motion.records import Stream
-from vggt_motion.sources.encoded import media_type_of
+from vggt_motion.sources.encoded import checked_media_type
 from vggt_motion.sources.selection import Selection
 from vggt_motion.sources.source import Frame
 from vggt_motion.sources.timing import NANOSECONDS, TimestampRepair, median_interval_ns
@@ -195,10 +195,7 @@ def _as_listed(entries: list[_Entry], accepted: dict[int, int]) -> list[_Entry]:
 
 def _read_image(payload: bytes) -> tuple[bytes, str]:
     encoded, _, _ = foxglove.decode_image(payload)
-    media_type = media_type_of(encoded)
-    if media_type is None:
-        raise CodecError("not a whole JPEG or PNG image")
-    return encoded, media_type
+    return encoded, checked_media_type(encoded)
 
 
 def _fingerprint(entries: list[_Entry], selection: Selection) -> str:

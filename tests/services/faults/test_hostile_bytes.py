@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import zstandard
@@ -52,6 +53,7 @@ def _appends() -> list[calls.AppendRequest]:
 
 APPENDS = _appends()
 RESULTS = [request for request in APPENDS if request.stream in (Stream.SUBMAP.value, Stream.CONSTRAINT.value)]
+PICTURE = bytes(cv2.imencode(".jpg", np.zeros((20, 32), np.uint8))[1])
 DEPTHS = [blob for request in RESULTS for blob in request.blobs]
 
 
@@ -95,7 +97,7 @@ ENTRIES: dict[str, tuple[Callable[[bytes], Any], list[bytes]]] = {
     ),
     "image": (
         lambda payload: decode_image(payload, ImageHeader(0, 1).encode()),
-        [encode_image(Frame(0, 1, b"\xff\xd8\xff\xe0" + bytes(50) + b"\xff\xd9", "image/jpeg"), "front")],
+        [encode_image(Frame(0, 1, PICTURE, "image/jpeg"), "front")],
     ),
     "image header": (
         lambda payload: decode_image(ENTRIES["image"][1][0], payload),
