@@ -26,6 +26,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from vggt_motion.errors import CodecError
 from vggt_motion.geometry import se3
+from vggt_motion.sources.timing import MAX_TIME_NS
 
 MAP_FRAME = "map"
 WORLD_FRAME = "world"
@@ -80,7 +81,7 @@ def decode_image(payload: bytes) -> tuple[bytes, str, int]:
     if not 0 <= message.timestamp.nanos < _NANOSECONDS:
         raise CodecError(f"image timestamp has {message.timestamp.nanos} nanoseconds")
     time_ns = message.timestamp.seconds * _NANOSECONDS + message.timestamp.nanos
-    if not 0 <= time_ns <= _MAX_TIME_NS:
+    if not 0 <= time_ns <= MAX_TIME_NS:
         raise CodecError(f"image timestamp of {message.timestamp.seconds} s is out of range")
     encoded = message.data
     if not encoded:

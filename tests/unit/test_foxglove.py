@@ -11,12 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vggt_motion import foxglove
+from vggt_motion.bus import codec
 from vggt_motion.bus.images import ImageHeader, decode_image, encode_image
 from vggt_motion.errors import CodecError
+from vggt_motion.records import BlobRef, Keyframe, MotionState
 from vggt_motion.sources.source import Frame
+from vggt_motion.sources.timing import MAX_TIME_NS, TimestampRepair
 
 PICTURE = bytes(cv2.imencode(".png", np.zeros((4, 6), np.uint8))[1])
-TIMES_NS = st.integers(0, 2**63 - 1)
+TIMES_NS = st.integers(0, MAX_TIME_NS)
 
 
 @given(st.binary(min_size=1, max_size=200), st.sampled_from(["image/jpeg", "image/png"]), TIMES_NS)
@@ -60,6 +63,7 @@ def test_hostile_bytes_end_as_one_line(payload: bytes, attachment: bytes) -> Non
         (CompressedImage(format="png"), "without image bytes"),
         (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=-1)), "out of range"),
         (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=2**40)), "out of range"),
+        (CompressedImage(data=b"x", format="png", timestamp=Timestamp(seconds=2**62 // 10**9)), "out of range"),
         (CompressedImage(data=b"x", format="png", timestamp=Timestamp(nanos=-5)), "-5 nanoseconds"),
         (CompressedImage(data=b"x", format="png", timestamp=Timestamp(nanos=10**9)), "1000000000 nanoseconds"),
     ],
@@ -67,6 +71,14 @@ def test_hostile_bytes_end_as_one_line(payload: bytes, attachment: bytes) -> Non
 def test_impossible_images_are_named(message: CompressedImage, reason: str) -> None:
     with pytest.raises(CodecError, match=reason):
         foxglove.decode_image(message.SerializeToString())
+
+
+def test_a_time_that_is_let_in_can_be_recorded_and_so_can_those_repaired_after_it() -> None:
+    repair = TimestampRepair(10**9)
+    for time_ns in (MAX_TIME_NS, MAX_TIME_NS, 0, 10**18 // 10):
+        image = BlobRef("0" * 64, 1, "image/png")
+        codec.encode(Keyframe("front", 0, 0, repair(time_ns), MotionState.LINEAR, 6, 4, image, None))
+    assert repair.count == 2
 
 
 def test_headers_of_another_schema_and_numbers_too_large_are_refused() -> None:

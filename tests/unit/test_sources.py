@@ -155,7 +155,7 @@ def test_fewer_times_than_images_are_continued(tmp_path: Path, caplog: pytest.Lo
     assert "2 times for 4 images" in caplog.text
 
 
-@pytest.mark.parametrize("text", ["0.0\nnan\n", "0.0\nabc\n", "-1\n2\n", "0\ninf\n"])
+@pytest.mark.parametrize("text", ["0.0\nnan\n", "0.0\nabc\n", "-1\n2\n", "0\ninf\n", "0\n4.1e9\n"])
 def test_bad_times_name_file_and_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "times.txt"
     path.write_text(text)

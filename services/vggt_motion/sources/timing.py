@@ -15,6 +15,7 @@ from vggt_motion.errors import SourceError
 _log = logging.getLogger(__name__)
 
 NANOSECONDS = 1_000_000_000
+MAX_TIME_NS = 4 * 10**18  # in the year 2096; records take 2**62, and times that are repaired run on from the last one
 REPAIR_STEP_NS = 1_000  # 1 us: visible in a TUM file with six decimals, and the next good time is not disturbed
 CLOCK_RESET_NS = NANOSECONDS  # a backward step larger than this is a clock that was set anew
 
@@ -78,7 +79,7 @@ def read_times(path: Path) -> list[int]:
         if not text:
             continue
         time_ns = _parse_time(text)
-        if time_ns is None or not 0 <= time_ns < 2**63:
+        if time_ns is None or not 0 <= time_ns <= MAX_TIME_NS:
             raise SourceError(f"{path}, line {number}: '{text[:40]}' is not a time in seconds")
         times.append(time_ns)
     return times
