@@ -463,6 +463,27 @@ def test_frames_of_a_bridge_are_those_that_the_frontend_accepted(tmp_path: Path)
         assert again.frame_count == 6
 
 
+@pytest.mark.parametrize("stranger_numbers", [False, True])
+def test_frames_of_a_stranger_on_the_same_key_are_not_taken_for_the_frontends(
+    tmp_path: Path, stranger_numbers: bool
+) -> None:
+    """The segments list frames 0 to 5; one more was published in the other way."""
+    path = tmp_path / "run.mcap"
+    segment = segment_pb2.Segment(schema_version=1, index=0, camera="front")
+    for index in range(6):
+        segment.frames.add(frame_index=index, capture_time_ns=index * FRAME_INTERVAL_NS)
+    entry = LogEntry("segment", 0, "segment/0", "vggt_motion.v1.Segment", segment.SerializeToString(), 0)
+    with Recording.open(path, chunk_bytes=CHUNK_BYTES) as recording:
+        for index in [77, *range(6)]:
+            f = frame(index)
+            if stranger_numbers == (index == 77):
+                recording.add_frame(FrameId("front", 0, index), f)
+            else:
+                recording.add_unnumbered_frame("front", f.encoded, f.media_type, f.capture_time_ns)
+        recording.add_entry(entry)
+    assert list(McapSource(path, Selection()).frames()) == [frame(index) for index in range(6)]
+
+
 def test_frames_of_a_bridge_without_times_are_all_taken(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     segment = segment_pb2.Segment(schema_version=1, index=0, camera="front")

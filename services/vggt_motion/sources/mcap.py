@@ -2,7 +2,8 @@
 
 Any MCAP file with foxglove.CompressedImage messages (JPEG or PNG) will do; in recordings of ours the frames are
 numbered, so that order and repeats in the file do not matter. Frames of a bridge that did not number them are taken as
-the recorded segments list them: those that the frontend accepted, and the ones after the last segment.
+the recorded segments list them: those that the frontend accepted, and the ones after the last segment. Where a file has
+both, the segments say which were the frontend's.
 """
 
 from __future__ import annotations
@@ -122,10 +123,12 @@ class McapSource:
         if len(counts) > 1:
             others = ", ".join(sorted(name for name in counts if name != topic))
             _log.warning("%s holds several cameras: %s is taken, not %s", self._scanner.path, topic, others)
-        chosen = [entry for entry in entries if entry.topic == topic]
-        if all(entry.is_numbered for entry in chosen):
-            return _in_order(chosen, self._scanner.path)
-        return _as_listed([entry for entry in chosen if not entry.is_numbered], accepted)
+        numbered = [entry for entry in entries if entry.topic == topic and entry.is_numbered]
+        unnumbered = [entry for entry in entries if entry.topic == topic and not entry.is_numbered]
+        # Whoever else published on the key while the frontend did: their frames are not those that it accepted.
+        if not unnumbered or _are_most(numbered, accepted):
+            return _in_order(numbered, self._scanner.path)
+        return _as_listed(unnumbered, accepted)
 
     def _nothing_found(self) -> str:
         damage = f"; the file is broken off: {self._scanner.damage}" if self._scanner.damage else ""
@@ -180,14 +183,19 @@ def _in_order(entries: list[_Entry], path: Path) -> list[_Entry]:
     return ordered
 
 
+def _are_most(entries: list[_Entry], accepted: dict[int, int]) -> bool:
+    """Whether frames are at least half of what the segments list."""
+    found = {entry.capture_time_ns for entry in entries} & accepted.keys()
+    return bool(accepted) and 2 * len(found) >= len(accepted)
+
+
 def _as_listed(entries: list[_Entry], accepted: dict[int, int]) -> list[_Entry]:
     """Frames without numbers: what the segments list, and what came after the last.
 
     All of them where there are no segments, and where the frontend had to give other times than the frames' own (a
     bridge that leaves the time unset), so that frames and segments cannot be brought together.
     """
-    times = {entry.capture_time_ns for entry in entries}
-    if not accepted or 2 * len(times & accepted.keys()) < len(accepted):
+    if not _are_most(entries, accepted):
         return entries
     last_ns = max(accepted)
     return [entry for entry in entries if entry.capture_time_ns in accepted or entry.capture_time_ns > last_ns]
