@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import numpy as np
 
 from vggt_motion.backend import colmap_export, posegraph
 from vggt_motion.backend.planner import current_constraints, undecided_joints
@@ -19,12 +18,13 @@ from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, compose
 from vggt_motion.bus import codec
 from vggt_motion.bus.log import RECORD_OF_STREAM
 from vggt_motion.config import Config
-from vggt_motion.errors import InputError, LedgerError, RequestRefusedError
+from vggt_motion.errors import CodecError, InputError, LedgerError, RequestRefusedError
 from vggt_motion.evaluation.trajectory_io import to_csv, to_json, to_kitti, to_tum
 from vggt_motion.ledger.directory import DATABASE_NAME, stored_blob
 from vggt_motion.ledger.sqlite import read_only
 from vggt_motion.ledger.store import sha256_hex
 from vggt_motion.records import BlobRef, GraphUpdate
+from vggt_motion.sources.encoded import decode_rgb
 
 _PAGE = 256
 
@@ -198,11 +198,12 @@ def _image_file(session: StoredSession, image: colmap_export.ColmapImage, record
     data = session.load_blob(session.state.keyframes[image.keyframe_id].image)
     if image.intrinsics == recorded.intrinsics:
         return data
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if pixels is None:
-        raise InputError(f"the image of keyframe {image.keyframe_id} cannot be decoded")
-    straight = colmap_export.undistort(np.asarray(pixels, dtype=np.uint8), recorded.intrinsics)
-    return bytes(cv2.imencode(".png", straight)[1])
+    try:
+        pixels = decode_rgb(data)
+    except CodecError as error:
+        raise InputError(f"keyframe {image.keyframe_id} is {error}") from error
+    straight = colmap_export.undistort(pixels, recorded.intrinsics)
+    return bytes(cv2.imencode(".png", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR))[1])
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import math
@@ -14,7 +15,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from vggt_motion import __version__
@@ -25,7 +25,7 @@ from vggt_motion.backend.state import LogState
 from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
 from vggt_motion.config import Config
 from vggt_motion.disk import NO_SPACE
-from vggt_motion.errors import DiskFullError, InputError
+from vggt_motion.errors import CodecError, DiskFullError, InputError
 from vggt_motion.evaluation import metrics as evaluation
 from vggt_motion.evaluation.report import write_report
 from vggt_motion.evaluation.report_data import (
@@ -41,6 +41,7 @@ from vggt_motion.evaluation.trajectory_io import read_kitti, read_tum, to_csv, t
 from vggt_motion.geometry.sim3 import Sim3
 from vggt_motion.geometry.track import PoseTrack
 from vggt_motion.records import BlobRef, EventKind, GraphUpdate, JobReport, SubmapGeometry, SubmapVerdict
+from vggt_motion.sources.encoded import decode_rgb
 
 METRICS_FILE = "metrics.json"
 _MIN_ALIGNED_POSES = 3
@@ -212,8 +213,9 @@ def _camera_view(
         geometry = next((found for s in submaps.values() if (found := s.frame(keyframe_id)) is not None), None)
         if geometry is None or frame.world_from_camera is None:
             continue
-        image = cv2.imdecode(np.frombuffer(load_blob(state.keyframes[keyframe_id].image), np.uint8), cv2.IMREAD_COLOR)
-        pixels = None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        pixels = None
+        with contextlib.suppress(CodecError):
+            pixels = decode_rgb(load_blob(state.keyframes[keyframe_id].image))
         return CameraView(frame.frame_index, frame.world_from_camera, geometry.intrinsics, pixels)
     return None
 

@@ -21,7 +21,7 @@ from vggt_motion.errors import CodecError, SourceError, SourceTruncatedError
 from vggt_motion.frontend.flow import GreyDecoder
 from vggt_motion.records import BlobRef, Keyframe, MotionState
 from vggt_motion.sources import encoded
-from vggt_motion.sources.encoded import JPEG, MAX_BYTES, MAX_SIDE_PX, PNG, checked_media_type, read_head
+from vggt_motion.sources.encoded import JPEG, MAX_BYTES, MAX_SIDE_PX, PNG, checked_media_type, decode_rgb, read_head
 from vggt_motion.sources.registry import open_source
 from vggt_motion.sources.source import Frame
 
@@ -269,3 +269,16 @@ def test_a_bomb_ends_a_folder_there(tmp_path: Path) -> None:
     assert next(frames).encoded == BASELINE
     with pytest.raises(SourceTruncatedError, match=r"1\.png is an image of 32000x32000 pixels"):
         next(frames)
+
+
+def test_pixels_are_those_of_the_file_with_red_first() -> None:
+    pixels = np.random.default_rng(3).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    png = cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
+    assert np.array_equal(decode_rgb(png), pixels)
+    jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
+    blue_first = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert blue_first is not None and np.array_equal(decode_rgb(jpeg), blue_first[..., ::-1])
+    with pytest.raises(CodecError, match="not a whole"):
+        decode_rgb(jpeg[:-10])
+    with pytest.raises(CodecError, match="not a readable"):
+        decode_rgb(png[:40] + bytes(len(png) - 60) + png[-20:])

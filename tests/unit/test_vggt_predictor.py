@@ -242,7 +242,7 @@ def test_jobs_together_equal_jobs_one_by_one(weights: Path, monkeypatch: pytest.
         assert geometry.spec == alone.spec and geometry.verdict is SubmapVerdict.GOOD
         for mine, other in zip(blobs, its_blobs, strict=True):
             np.testing.assert_allclose(codec.decode_depth(mine)[0], codec.decode_depth(other)[0], rtol=2e-3)
-    assert damaged[1] == "keyframe front/0/00000003: the image cannot be decoded"
+    assert damaged[1] == "keyframe front/0/00000003 is not a whole JPEG or PNG image"
     task._predictor_of.cache_clear()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 
-import cv2
 import numpy as np
 
 from vggt_motion.backend.map import MapFrame, PointMap, build_map
@@ -14,6 +13,7 @@ from vggt_motion.bus.depth import decode_depth
 from vggt_motion.config import BackendConfig
 from vggt_motion.errors import CodecError
 from vggt_motion.records import BlobRef, GraphUpdate, Keyframe, SubmapGeometry
+from vggt_motion.sources.encoded import decode_rgb
 
 
 def main_component(trajectory: Trajectory) -> int:
@@ -87,9 +87,10 @@ def map_frames(
             if frame is None or keyframe is None or keyframe_id in copies:
                 continue
             depth, confidence = decode_depth(load_blob(frame.depth))
-            image = cv2.imdecode(np.frombuffer(load_blob(keyframe.image), np.uint8), cv2.IMREAD_COLOR)
-            if image is None:
-                raise CodecError(f"the image of keyframe {keyframe_id} cannot be decoded")
+            try:
+                image = decode_rgb(load_blob(keyframe.image))
+            except CodecError as error:
+                raise CodecError(f"keyframe {keyframe_id} is {error}") from error
             yield MapFrame(
                 keyframe_id=keyframe_id,
                 depth=depth,
@@ -97,5 +98,5 @@ def map_frames(
                 intrinsics=frame.intrinsics,
                 world_from_submap=pose.world_from_submap,
                 submap_from_camera=frame.submap_from_camera,
-                image=np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8),
+                image=image,
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import time
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from vggt_motion.bus.depth import encode_depth
 from vggt_motion.config import InferenceConfig
-from vggt_motion.errors import PredictionError
+from vggt_motion.errors import CodecError, PredictionError
 from vggt_motion.geometry import se3
 from vggt_motion.inference.predictor import (
     BatchPredictor,
@@ -25,6 +26,7 @@ from vggt_motion.inference.predictor import (
 )
 from vggt_motion.inference.registry import choose_predictor, create_predictor
 from vggt_motion.records import BlobRef, FrameGeometry, PredictTask, SubmapGeometry
+from vggt_motion.sources.encoded import decode_rgb
 
 _log = logging.getLogger(__name__)
 DEPTH_MEDIA_TYPE = "application/vnd.vggt-motion.depth"
@@ -163,14 +165,16 @@ def _predictor(config: InferenceConfig) -> Predictor:
 
 
 def _decode_rgb(encoded: bytes, keyframe_id: str) -> npt.NDArray[np.uint8]:
-    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise PredictionError(f"keyframe {keyframe_id}: the image cannot be decoded")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    try:
+        return decode_rgb(encoded)
+    except CodecError as error:
+        raise PredictionError(f"keyframe {keyframe_id} is {error}") from error
 
 
 def _decode_mask(encoded: bytes, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
-    mask = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    mask = None
+    with contextlib.suppress(cv2.error):
+        mask = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
     if mask is None or mask.shape != shape:
         raise PredictionError("the ego mask cannot be decoded, or is not of the size of the images")
     return np.asarray(mask > 0)

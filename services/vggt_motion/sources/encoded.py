@@ -122,6 +122,22 @@ def checked_media_type(encoded: bytes) -> str:
     return head.media_type
 
 
+def decode_rgb(encoded: bytes) -> npt.NDArray[np.uint8]:
+    """Pixels of a JPEG or PNG file that may be a frame, (H, W, 3), red first.
+
+    Raises:
+        CodecError: as :func:`checked_media_type`, or it cannot be decoded.
+    """
+    checked_media_type(encoded)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR_RGB)
+    except cv2.error as error:
+        raise CodecError("not a readable image") from error
+    if pixels is None:
+        raise CodecError("not a readable image")
+    return np.asarray(pixels, np.uint8)
+
+
 def transcode_to_png(encoded: bytes) -> bytes:
     """Re-encode any other image that OpenCV reads (BMP, TIFF, WebP, PNM) as PNG, without loss.
 
