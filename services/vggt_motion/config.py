@@ -291,7 +291,9 @@ class BackendConfig(Section):
         0.05, ge=0, description="voxel edge as a share of the median keyframe distance; 0 = none"
     )
     map_max_points: int = Field(2_000_000, ge=1000)
-    known_distance_m: float | None = Field(None, gt=0, description="known travelled distance: sets the scale")
+    known_distance_m: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="known travelled distance: sets the scale"
+    )
 
 
 class GatewayConfig(Section):

@@ -38,7 +38,7 @@ _STATUS_INTERVAL_S = 0.5
 _START_TIMEOUT_S = 60.0
 _RECORDER_TIMEOUT_S = 30.0
 _REST_TIMEOUT_S = 5.0
-_RECORDER_QUIET_S = 4.0  # no frame for so long: those that are missing went by while no recorder was there
+_RECORDER_QUIET_S = 4.0  # no frame for so long: no more will come
 _LOG_PATIENCE_S = 10.0  # what the frontend appended last is seen here after this at the latest
 CONFIG_FILE = "config.yaml"
 LEDGER_FOLDER = "ledger"
@@ -76,6 +76,7 @@ class Progress:
     lag_submaps: int  # closed segments that have no submap yet
     dead_jobs: int
     is_input_complete: bool
+    waiting: str  # why frontend or recorder do not go on at this moment; mostly empty
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ class RunOutcome:
     seconds: float
     start_up_seconds: float
     restart_count: int
+    missing_frame_count: int  # that went by while no recorder was there
 
 
 def session_identity(request: RunRequest, source: Source) -> SessionIdentity:
@@ -257,6 +259,7 @@ class LocalRun:
                     seconds=time.monotonic() - begin,
                     start_up_seconds=start_up_seconds,
                     restart_count=supervisor.restart_count,
+                    missing_frame_count=self._missing_frame_count(state, watch),
                 )
                 with _supervised(supervisor, bus):
                     finish(outcome, bus)
@@ -287,7 +290,9 @@ class LocalRun:
             try:
                 return open_bus(impatient)
             except BusError:
-                if time.monotonic() > end or self._interrupts:
+                if self._interrupts:
+                    raise KeyboardInterrupt from None
+                if time.monotonic() > end:
                     raise
 
     def _wait_for(self, supervisor: Supervisor, watch: ServiceWatch, commands: list[ServiceCommand]) -> None:
@@ -352,8 +357,15 @@ class LocalRun:
             follower.close()
         return state
 
+    def _missing_frame_count(self, state: LogState, watch: ServiceWatch) -> int:
+        report = watch.newest_report("recorder")
+        if not self.config.recorder.enabled or report is None or state.stream_ended is None:
+            return 0
+        return max(0, int(state.stream_ended.detail["frame_count"]) - int(report.counters.get("frames", 0)))
+
     def _progress(self, state: LogState, watch: ServiceWatch) -> Progress:
-        frontend = watch.newest_report("frontend")
+        frontend, recorder = watch.newest_report("frontend"), watch.newest_report("recorder")
+        reports = [report for report in (frontend, recorder) if report is not None]
         counters = frontend.counters if frontend is not None else {}
         newest = max(state.keyframes.values(), key=lambda keyframe: keyframe.frame_index, default=None)
         predicted = {index for index, _ in state.submaps}
@@ -372,6 +384,7 @@ class LocalRun:
             lag_submaps=len(state.unpredicted_segments()),
             dead_jobs=len(state.dead_jobs),
             is_input_complete=state.is_input_complete,
+            waiting=next((report.detail for report in reports if report.state == "waiting"), ""),
         )
 
 
@@ -434,10 +447,8 @@ class _RecorderProgress:
         wanted = int(ended.detail["frame_count"]) if ended is not None else 0
         if frame_count >= wanted:
             return True
-        if now - self._quiet_since < _RECORDER_QUIET_S:
-            return False
-        _log.warning("frames are missing in the recording", extra={"missing": wanted - int(frame_count)})
-        return True
+        # Then those that are missing went by, and the results say how many.
+        return now - self._quiet_since >= _RECORDER_QUIET_S
 
 
 def _take_in_rest(follower: LogFollower, state: LogState, ledger: LedgerClient) -> None:

@@ -63,6 +63,7 @@ class RunFacts:
     first_frame: int = 0  # of the source, with --start and --stride: which line of the ground truth frame n belongs to
     stride: int = 1
     dead_jobs: tuple[JobReport, ...] = ()
+    missing_frame_count: int = 0  # in the recording
 
 
 def read_ground_truth(path: Path) -> PoseTrack | list[PoseTrack]:
@@ -285,7 +286,7 @@ def _metrics(
         "source": facts.source,
         "predictor": facts.predictor,
         "predictor_reason": facts.predictor_reason,
-        "exit_code": facts.exit_code,
+        "exit_code": facts.exit_code if facts.interrupted or _has_pose(trajectory) else InputError.exit_code,
         "is_complete": graph is not None and graph.is_final and not facts.interrupted,
         "truncated": ended.detail.get("truncated", "") if ended is not None else "",
         "frame_count": len(trajectory.frames),
@@ -309,7 +310,7 @@ def _metrics(
         "start_up_seconds": facts.start_up_seconds,
         "stage_seconds": _stage_seconds(state, facts),
         "restart_count": facts.restart_count,
-        "warnings": warnings(state, trajectory),
+        "warnings": warnings(state, trajectory, facts.missing_frame_count),
     }
 
 
@@ -325,7 +326,11 @@ def _verdicts(state: LogState) -> dict[int, SubmapVerdict]:
     return last | {index: geometry.verdict for index, geometry in state.usable_submaps().items()}
 
 
-def warnings(state: LogState, trajectory: Trajectory) -> list[str]:
+def _has_pose(trajectory: Trajectory) -> bool:
+    return any(frame.world_from_camera is not None for frame in trajectory.frames)
+
+
+def warnings(state: LogState, trajectory: Trajectory, missing_frame_count: int = 0) -> list[str]:
     """What a person should know before trusting the result, one line each."""
     lines = [event.message for event in state.events.values() if event.kind is EventKind.WARNING]
     ended = state.stream_ended
@@ -347,6 +352,11 @@ def warnings(state: LogState, trajectory: Trajectory) -> list[str]:
     missing = sum(frame.world_from_camera is None for frame in trajectory.frames)
     if missing:
         lines.append(f"{missing} of {len(trajectory.frames)} frames have no pose")
+    if missing_frame_count:
+        lines.append(
+            f"the recording lacks {missing_frame_count} frames, which went by while no recorder was there; "
+            "a run of the recording gives another trajectory"
+        )
     return lines
 
 

@@ -32,16 +32,15 @@ INTERRUPTED_EXIT_CODE = 130
 _DISK_RETRY_S = 1.0
 _INTERRUPTED_PATIENCE_S = 15.0
 _PATIENCE_S = 120.0  # a ledger that is killed now is started again, or the run is ended as a crash loop
-_FILES = (
+_RESULTS = (
     results.METRICS_FILE,
-    launch.CONFIG_FILE,
     "trajectory_keyframes.tum",
     "trajectory_frames.tum",
     "trajectory_frames.kitti",
-    "map.ply",
+    "trajectory_frames.csv",
     "report.html",
-    "run.mcap",
 )
+_FILES = (*_RESULTS, launch.CONFIG_FILE, "map.ply", "run.mcap")
 _STATE_NAMES = {MotionState.STATIC: "standing", MotionState.TURNING: "turning", MotionState.LINEAR: "straight"}
 
 
@@ -89,6 +88,8 @@ def run_to_results(request: launch.RunRequest, *, ground_truth: Path | None, fre
         return INTERRUPTED_EXIT_CODE
     if outcome.exit_code == SourceTruncatedError.exit_code:
         console.print(f"The input ended early: {escape(metrics['truncated'])}")
+    if metrics["exit_code"] == InputError.exit_code:
+        raise InputError(f"no trajectory can be made of this input: {next(iter(metrics['warnings']), 'no submap')}")
     return outcome.exit_code
 
 
@@ -123,14 +124,16 @@ def _claim_folder(request: launch.RunRequest, run: launch.LocalRun, *, fresh: bo
         state = prepare_session(ledger, run.identity)
         with locked(ledger):
             pass  # in use by another run: said now, in one line
-        if state is not SessionState.FINISHED or not metrics_file.exists():
+        if state is not SessionState.FINISHED:
             return None
-        metrics: dict[str, Any] = json.loads(metrics_file.read_text(encoding="utf-8"))
-        return metrics
+        if not all((request.out / name).exists() for name in _RESULTS):
+            return None  # what is gone is made again from the ledger
+        with contextlib.suppress(ValueError):
+            metrics: dict[str, Any] = json.loads(metrics_file.read_text(encoding="utf-8"))
+            return metrics
+        return None
     except OSError as error:
         raise InputError(f"cannot write to {request.out}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise InputError(f"{metrics_file} is damaged ({error}): discard the run with --fresh") from error
 
 
 def _write_results(
@@ -158,6 +161,7 @@ def _write_results(
         first_frame=request.start,
         stride=request.stride,
         dead_jobs=tuple(dead_jobs),
+        missing_frame_count=outcome.missing_frame_count,
     )
     load_blob = functools.partial(
         _read_blob, request.out / launch.LEDGER_FOLDER, LedgerClient(bus), patience_s=patience_s
@@ -201,6 +205,8 @@ def _display(console: Console, source: str) -> Iterator[Callable[[launch.Progres
             )
             if progress.dead_jobs:
                 text += f", {progress.dead_jobs} jobs given up"
+            if progress.waiting:
+                text += f"; waiting: {progress.waiting}"
             bar.update(
                 task,
                 description=state or "running",

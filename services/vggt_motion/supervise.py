@@ -128,7 +128,9 @@ class Supervisor:
         backoff = min(_FIRST_BACKOFF_S * 2 ** (len(child.crashes) - 1), _MAX_BACKOFF_S)
         child.restart_at = now + backoff
         _log.warning(
-            "service ended, starting it again",
+            "%s ended (%s), starting it again",
+            command.label,
+            f"exit code {exit_code}" if exit_code >= 0 else f"killed by {signal.Signals(-exit_code).name}",
             extra={"service": command.label, "exit_code": exit_code, "backoff_s": backoff, "last_words": words},
         )
 

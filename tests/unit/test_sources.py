@@ -231,10 +231,19 @@ def test_text_named_jpg_in_the_middle_ends_the_input_there(tmp_path: Path) -> No
     assert error is not None and "frame 3" in str(error) and "3.png" in str(error)
 
 
+@pytest.mark.parametrize("text", ["12.5 3 4\n" * 2000, "für alle Fälle " * 273 + "x" * 4 + "ü", "x"])
+def test_text_is_no_video(tmp_path: Path, text: str) -> None:
+    """FFmpeg would draw it, a letter at a time."""
+    path = tmp_path / "poses.txt"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SourceError, match="is a text file, not a video"):
+        open_source(str(path))
+
+
 def test_text_named_mp4_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mp4"
     path.write_text("hello")
-    with pytest.raises(SourceError, match="not a readable video"):
+    with pytest.raises(SourceError, match="is a text file, not a video"):
         open_source(str(path))
     assert capfd.readouterr().err == "", "the libraries below must not add lines of their own"
 

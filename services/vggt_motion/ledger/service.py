@@ -341,6 +341,7 @@ class Desk:
         self._wake_publisher = wake_publisher
         self._lock = threading.Lock()
         self._refused_count = 0
+        self._full_count = 0
         self._waiting_claims = 0
         self._stored_bytes = 0
         self._sizes_until_s = 0.0
@@ -531,6 +532,10 @@ class Desk:
     def _count_refusal(self, key: str, error: Exception) -> None:
         with self._lock:
             self._refused_count += 1
+            if isinstance(error, DiskFullError):
+                self._full_count += 1
+                if self._full_count & (self._full_count - 1):
+                    return  # the 1st, 2nd, 4th, 8th, ... is told: the log may lie on that disk
         _log.warning("a request was refused", extra={"key": key, "reason": one_line(str(error))})
 
 

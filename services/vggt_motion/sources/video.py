@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 
 _MILLISECOND_NS = 1_000_000
 _SAMPLE_BYTES = 2**20
+_HEAD_BYTES = 4096
 _MAX_FRAME_COUNT = 10**9  # a raw stream without a header has a nonsensical count
 
 
@@ -168,6 +169,8 @@ def quiet_ffmpeg() -> None:
 def _open(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
         raise SourceError(f"no such file: {path}")
+    if _is_text(path):  # FFmpeg draws it, a letter at a time
+        raise SourceError(f"{path} is a text file, not a video")
     quiet_ffmpeg()
     # Hardware decoders differ between machines; software decoding of a file is bit-exact by the standard.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE])
@@ -175,6 +178,24 @@ def _open(path: Path) -> cv2.VideoCapture:
         capture.release()
         raise SourceError(f"{path} is not a readable video")
     return capture
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file begins as text does, other than a playlist."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
+    if head.startswith((b"#EXTM3U", b"ffconcat")):
+        return False
+    try:
+        text = head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 3:  # else a character at the end was cut
+            return False
+        text = head[: error.start].decode("utf-8")
+    return bool(text) and all(character.isprintable() or character.isspace() for character in text)
 
 
 def _digest(path: Path) -> str:
