@@ -22,7 +22,7 @@ from vggt_motion.backend import focal, posegraph
 from vggt_motion.backend.planner import current_constraints, undecided_joints
 from vggt_motion.backend.session_map import build_session_map, main_component
 from vggt_motion.backend.state import LogState
-from vggt_motion.backend.trajectory import NO_COMPONENT, Trajectory, TrajectoryPose, compose
+from vggt_motion.backend.trajectory import NO_COMPONENT, PoseOrigin, Trajectory, TrajectoryPose, compose
 from vggt_motion.config import Config
 from vggt_motion.disk import NO_SPACE
 from vggt_motion.errors import CodecError, DiskFullError, InputError
@@ -352,6 +352,9 @@ def warnings(state: LogState, trajectory: Trajectory, missing_frame_count: int =
     missing = sum(frame.world_from_camera is None for frame in trajectory.frames)
     if missing:
         lines.append(f"{missing} of {len(trajectory.frames)} frames have no pose")
+    held = trajectory.origin_counts().get(PoseOrigin.HELD, 0)
+    if held:
+        lines.append(f"{held} of {len(trajectory.frames)} frames hold the pose of the nearest keyframe that has one")
     if missing_frame_count:
         lines.append(
             f"the recording lacks {missing_frame_count} frames, which went by while no recorder was there; "
