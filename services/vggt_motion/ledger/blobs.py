@@ -43,6 +43,7 @@ class BlobFiles:
         *,
         free_bytes: Callable[[], int] | None = None,
         files: FileOperations | None = None,
+        is_read_only: bool = False,
     ) -> None:
         """Open or create the store and remove what an interrupted write left.
 
@@ -50,6 +51,7 @@ class BlobFiles:
             folder: where the files are.
             free_bytes: space left in bytes; defaults to asking the file system.
             files: the file operations; defaults to the real ones.
+            is_read_only: True to create and remove nothing.
 
         Raises:
             LedgerError: the folder cannot be created or written.
@@ -64,6 +66,8 @@ class BlobFiles:
         self._sync_names = SharedSync(lambda: self._files.sync_folder(folder))
         self._lock = threading.Lock()
         self._claimed_bytes = 0  # of writes that are under way: many at once must not overshoot the reserve together
+        if is_read_only:
+            return
         try:
             make_folder(self._incoming, self._files)
             for leftover in self._incoming.iterdir():
@@ -124,7 +128,8 @@ class BlobFiles:
 
     def names(self) -> Iterator[str]:
         """SHA-256 of every stored file, in order, whether a record refers to it or not."""
-        yield from sorted(path.name for path in self._folder.iterdir() if _SHA256.fullmatch(path.name))
+        paths = self._folder.iterdir() if self._folder.exists() else ()
+        yield from sorted(path.name for path in paths if _SHA256.fullmatch(path.name))
 
     def size_bytes(self, sha256: str) -> int:
         """Size of a stored file."""

@@ -37,7 +37,12 @@ class PackFiles:
     """Packs in a folder; safe for use from many threads. One process at a time writes (the lock of the session)."""
 
     def __init__(
-        self, folder: Path, *, max_pack_bytes: int = MAX_PACK_BYTES, files: FileOperations | None = None
+        self,
+        folder: Path,
+        *,
+        max_pack_bytes: int = MAX_PACK_BYTES,
+        files: FileOperations | None = None,
+        is_read_only: bool = False,
     ) -> None:
         """Open or create the folder.
 
@@ -45,6 +50,7 @@ class PackFiles:
             folder: where the packs are.
             max_pack_bytes: a pack that has grown so long is followed by a new one.
             files: the file operations; defaults to the real ones.
+            is_read_only: True to create nothing.
 
         Raises:
             LedgerError: the folder cannot be created or read.
@@ -59,8 +65,9 @@ class PackFiles:
         self._background = ThreadPoolExecutor(1, thread_name_prefix="packs")
         self._is_closed = False
         try:
-            make_folder(folder, self._files)
-            self._files.sync_folder(folder.parent)  # a process that was killed may have made the folder only
+            if not is_read_only:
+                make_folder(folder, self._files)
+                self._files.sync_folder(folder.parent)  # a process that was killed may have made the folder only
             self._number = max(self.numbers(), default=1)
         except OSError as error:
             raise LedgerError(f"cannot use {folder} for packs: {error.strerror or error}") from error
@@ -161,7 +168,8 @@ class PackFiles:
 
     def numbers(self) -> list[int]:
         """The numbers of all packs, in order."""
-        return sorted(int(match[1]) for path in self._folder.iterdir() if (match := _NAME.fullmatch(path.name)))
+        paths = self._folder.iterdir() if self._folder.exists() else ()
+        return sorted(int(match[1]) for path in paths if (match := _NAME.fullmatch(path.name)))
 
     def unused_bytes(self, used: Iterable[Place]) -> dict[int, int]:
         """Per pack, how many bytes lie behind the block in which the last place that is used ends."""
@@ -223,9 +231,17 @@ def read_place(folder: Path, place: Place) -> bytes:
     """
     descriptor = open_direct(_path(folder, place.pack), os.O_RDONLY)
     try:
-        return read_direct(descriptor, place.offset_bytes, place.size_bytes)
+        return _read(descriptor, place)
     finally:
         os.close(descriptor)
+
+
+def _read(descriptor: int, place: Place) -> bytes:
+    # A row that is damaged may ask for anything.
+    size_bytes = min(place.size_bytes, os.fstat(descriptor).st_size - place.offset_bytes)
+    if place.offset_bytes < 0 or size_bytes <= 0:
+        return b""
+    return read_direct(descriptor, place.offset_bytes, size_bytes)
 
 
 def _path(folder: Path, number: int) -> Path:
@@ -314,7 +330,7 @@ class _Pack:
         self._shared_sync()
 
     def read(self, place: Place) -> bytes:
-        return read_direct(self._descriptor, place.offset_bytes, place.size_bytes)
+        return _read(self._descriptor, place)
 
     def close(self) -> None:
         os.close(self._descriptor)
