@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import hashlib
 import io
+import shutil
 import sqlite3
 import tarfile
 from pathlib import Path
@@ -9,8 +12,11 @@ from pathlib import Path
 import pytest
 
 from ledger_helpers import damage_blob, open_ledger, predict, record
+from ledger_processes import keyframe
 from vggt_motion.bus import codec
+from vggt_motion.bus.ledger import append_request
 from vggt_motion.errors import InputError, LedgerError
+from vggt_motion.ledger.admission import admitted
 from vggt_motion.ledger.check import check
 from vggt_motion.ledger.export import export_session, import_session
 from vggt_motion.ledger.sessions import (
@@ -22,10 +28,11 @@ from vggt_motion.ledger.sessions import (
     remove_session,
     summary_of,
 )
-from vggt_motion.ledger.store import BlobEntry, NewRecord
-from vggt_motion.records import Event, EventKind, JobKind
+from vggt_motion.ledger.store import BlobEntry, NewRecord, Transaction
+from vggt_motion.records import Event, EventKind, JobKind, JobState
 
 IDENTITY = SessionIdentity("street.mp4", "video:1", "config:1")
+IMAGES = (b"i" * 40, b"p" * 150, b"f" * 1000)  # among the rows, in a pack, in a file
 
 
 def entry(data: bytes) -> BlobEntry:
@@ -59,6 +66,12 @@ def execute(directory: Path, statement: str) -> None:
     connection.close()
 
 
+def files_of(directory: Path) -> dict[str, bytes]:
+    """Every file but the lock, which a check takes."""
+    paths = (path for path in directory.rglob("*") if path.is_file() and path.name != "session.lock")
+    return {str(path.relative_to(directory)): path.read_bytes() for path in paths}
+
+
 def test_a_sound_session_is_found_sound(session: Path) -> None:
     report = check(session)
     assert report.is_sound and report.repaired == ()
@@ -72,14 +85,50 @@ def test_what_an_interrupted_write_left_is_repaired(session: Path) -> None:
     ledger.blobs.put([b"written, but its row never was"], keep_free_bytes=0)
     ledger.close()
     (session / "blobs" / "incoming" / "torn.0").write_bytes(b"to")
-    before = check(session, repair=False)
-    assert blob_path(session, b"written, but its row never was").exists()
-    assert (session / "blobs" / "incoming" / "torn.0").exists() is False or before.repaired
     report = check(session)
     assert report.is_sound
+    assert "1 unfinished blob writes removed" in report.repaired
+    assert not (session / "blobs" / "incoming" / "torn.0").exists()
     assert any("1 blobs of writes that were never acknowledged" in line for line in report.repaired)
     assert not blob_path(session, b"written, but its row never was").exists()
     assert check(session).repaired == ()
+
+
+def finish(transaction: Transaction, job_id: str) -> None:
+    job = transaction.find_job(job_id)
+    assert job is not None
+    transaction.update_job(dataclasses.replace(job, state=JobState.DONE))
+
+
+def test_without_repair_nothing_changes_on_disk_and_the_report_says_what_would(session: Path, tmp_path: Path) -> None:
+    ledger = open_ledger(session, packed_blob_bytes=100)
+    ledger.blobs.put([b"written, but its row never was"], keep_free_bytes=0)
+    ledger.packs.append([b"packed, but its row never was"])
+    ledger.rows.write(lambda transaction: finish(transaction, "s1"))
+    image = tmp_path / "image"  # as the ledger leaves it when it is killed
+    shutil.copytree(session, image)
+    ledger.close()
+    (image / "ledger.db-shm").unlink()
+    (image / "blobs" / "incoming" / "torn.0").write_bytes(b"to")
+    for content in (b"otheR", b"other"):
+        blob_path(image, b"other").write_bytes(content)
+        files = files_of(image)
+        assert files["ledger.db-wal"]
+        looked = check(image, repair=False)
+        assert files_of(image) == files
+        assert looked.is_sound == (content == b"other")
+    assert len(looked.repaired) == 5, looked.repaired
+    report = check(image)
+    assert (report.repaired, report.problems) == (looked.repaired, looked.problems)
+    assert check(image).repaired == ()
+
+
+def test_without_repair_no_folder_is_made(session: Path) -> None:
+    shutil.rmtree(session / "blobs")
+    report = check(session, repair=False)
+    assert [line.split(": ")[0] for line in report.problems] == ["keyframe/0 ('k0')", "keyframe/1 ('k1')"]
+    assert all("is missing" in line for line in report.problems)
+    assert not (session / "blobs").exists()
 
 
 def test_a_torn_write_ahead_log_is_recovered_and_reported(session: Path, tmp_path: Path) -> None:
@@ -161,6 +210,196 @@ def test_a_damaged_row_is_named(session: Path, statement: str, problem: str) -> 
     report = check(session)
     assert any(line.startswith(problem) for line in report.problems), report.problems
     assert blob_path(session, b"image").exists(), "what a damaged row may refer to is kept"
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE jobs SET payload = x'00' WHERE job_id = 's1'",
+        "UPDATE jobs SET model = 'other' WHERE job_id = 's1'",
+        "UPDATE jobs SET kind = 'pregict' WHERE job_id = 's1'",
+        "UPDATE jobs SET priority = priority + 1 WHERE job_id = 's1'",
+        "UPDATE jobs SET job_id = 's9' WHERE job_id = 's1'",
+        "UPDATE meta SET value = 'f' || value WHERE key = 'ledger_id'",
+        "DELETE FROM meta WHERE key = 'ledger_id'",
+        "UPDATE meta SET key = 'ledger_ie' WHERE key = 'ledger_id'",
+        "UPDATE streams SET next_sequence = 1 WHERE stream = 'keyframe'",
+        "UPDATE streams SET stream = 'keyfrale' WHERE stream = 'keyframe'",
+        "UPDATE records SET stream = 'keyfrale' WHERE record_id = 'k1'",
+        "UPDATE records SET payload = 'text' WHERE record_id = 'k1'",
+        "UPDATE records SET append_time_ns = x'ff' WHERE record_id = 'k1'",
+        "UPDATE records SET record_id = CAST(x'ff' AS TEXT) WHERE record_id = 'k1'",
+        "UPDATE records SET record_id = 's9' WHERE record_id = 's0'",  # the result of a job, which stays done
+        "DELETE FROM record_blobs",  # of records that this version cannot decode
+        "DELETE FROM record_blobs WHERE sequence = 0",
+        "UPDATE record_blobs SET sha256 = 'no hash' WHERE sequence = 0",
+    ],
+)
+def test_damage_of_any_row_is_reported_and_nothing_is_removed(session: Path, statement: str) -> None:
+    (session / "blobs" / "incoming" / "torn").touch()
+    execute(session, statement)
+    report = check(session)
+    assert report.problems and report.repaired == ("1 unfinished blob writes removed",), report
+    assert check(session).problems == report.problems
+    assert blob_path(session, b"image").exists() and blob_path(session, b"other").exists()
+
+
+def test_the_report_of_a_damaged_name_is_one_line_a_finding(session: Path) -> None:
+    execute(session, "UPDATE records SET stream = CAST(x'0aff1b' AS TEXT) WHERE record_id = 'k1'")
+    report = check(session)
+    lines = report.to_text().splitlines()
+    assert len(lines) == 2 + len(report.problems) and all(line.isprintable() for line in lines)
+
+
+def test_a_damaged_row_does_not_hide_the_others(session: Path) -> None:
+    execute(session, "UPDATE records SET payload_type = CAST(x'ff' AS TEXT) WHERE record_id = 'k0'")
+    execute(session, "UPDATE records SET payload = x'00' WHERE record_id = 'k1'")
+    execute(session, "UPDATE jobs SET payload = x'00'; UPDATE jobs SET kind = CAST(x'ff' AS TEXT) WHERE job_id = 's0'")
+    report = check(session)
+    assert [line.split(":")[0] for line in report.problems] == [
+        "keyframe/0",
+        "keyframe/1 ('k1')",
+        "job 's0'",
+        "job 's1'",
+    ]
+    assert (report.record_counts, report.job_count) == ({"keyframe": 2, "submap": 1}, 2)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "state = 'opef'",
+        "state = 'leased'",
+        "attempt = -1",
+        "failure_count = 2",
+        "last_reason = CAST(x'ff' AS TEXT)",
+        "not_before_s = 'soon'",
+    ],
+)
+def test_a_job_whose_progress_is_damaged_begins_anew(session: Path, change: str) -> None:
+    execute(session, f"UPDATE jobs SET {change} WHERE job_id = 's1'")
+    report = check(session)
+    assert report.is_sound, report.problems
+    assert report.repaired == ("job 's1': how far it had come was damaged; it is open, with all counts at zero",)
+    assert check(session).repaired == ()
+    ledger = open_ledger(session, new_lease_id=lambda: "another")
+    lease = ledger.jobs.claim([JobKind.PREDICT], [], "inference/a")
+    assert lease is not None and (lease.job.job_id, lease.attempt) == ("s1", 1)
+    ledger.close()
+
+
+def test_a_damaged_lease_is_forgotten(session: Path) -> None:
+    execute(session, "UPDATE leases SET worker = 'inference/b'")
+    report = check(session)
+    assert report.is_sound and "lease 'lease0' was damaged and is forgotten" in report.repaired[0]
+    assert check(session).repaired == ()
+
+
+@pytest.fixture
+def decodable(tmp_path: Path) -> Path:
+    """A session of records as the services make them: one blob each, among the rows, in a pack and in a file."""
+    directory = tmp_path / "decodable"
+    ledger = open_ledger(directory, inline_bytes=100, packed_blob_bytes=500)
+    for index, image in enumerate(IMAGES):
+        frame = keyframe(index, image)
+        ledger.store.append(*admitted(append_request("keyframe", frame.keyframe_id, frame, [image])))
+    ledger.close()
+    return directory
+
+
+@pytest.mark.parametrize(
+    ("statement", "repaired_count"),
+    [
+        ("DELETE FROM record_blobs", 3),
+        ("DELETE FROM record_blobs; DELETE FROM blobs WHERE pack = 0", 4),
+        ("UPDATE record_blobs SET sha256 = 'no hash' WHERE sequence = 1", 1),
+        ("UPDATE record_blobs SET sequence = 7 WHERE sequence = 1", 2),
+        ("INSERT INTO record_blobs SELECT stream, 0, sha256 FROM record_blobs WHERE sequence = 1", 1),
+        ("UPDATE blobs SET size_bytes = size_bytes + 1 WHERE pack = 0", 2),
+        ("UPDATE blobs SET is_file = 1 - is_file", 3),
+        ("UPDATE blobs SET pack = 1 WHERE pack = 0", 2),
+        ("UPDATE blobs SET pack = -1, offset_bytes = -5 WHERE pack = 0", 2),
+        ("UPDATE blobs SET offset_bytes = offset_bytes + 1 WHERE pack = 0", 2),
+        ("INSERT INTO blobs VALUES ('no hash', 1, 1, 0, 0); INSERT INTO contents VALUES ('none', x'00')", 1),
+    ],
+)
+def test_which_blobs_a_record_has_and_where_is_found_out_again(
+    decodable: Path, statement: str, repaired_count: int
+) -> None:
+    def rows() -> list[object]:
+        with contextlib.closing(sqlite3.connect(decodable / "ledger.db")) as connection:
+            tables = ("blobs", "record_blobs", "contents")
+            return [sorted(connection.execute(f"SELECT * FROM {table}").fetchall()) for table in tables]
+
+    before = rows()
+    execute(decodable, statement)
+    report = check(decodable)
+    assert report.is_sound and report.blob_count == 3, report.problems
+    assert len(report.repaired) == repaired_count, report.repaired
+    assert rows() == before
+    assert check(decodable).repaired == ()
+    ledger = open_ledger(decodable)
+    assert [ledger.store.blob(entry(image).sha256) for image in IMAGES] == list(IMAGES)
+    ledger.close()
+
+
+@pytest.mark.parametrize("change", ["offset_bytes = -1", "size_bytes = 1 << 60", "pack = -5", "offset_bytes = 1 << 62"])
+def test_a_place_that_cannot_be_is_a_damaged_blob_and_the_pack_stays_as_it_is(decodable: Path, change: str) -> None:
+    execute(decodable, f"UPDATE blobs SET {change} WHERE pack <> 0")
+    pack = (decodable / "blobs" / "packs" / "00000001.pack").read_bytes()
+    with pytest.raises(LedgerError, match=r"damaged|missing"):
+        export_session(decodable, decodable / "session.tar")
+    for state in ("damaged", "missing"):
+        (problem,) = check(decodable).problems
+        assert f"blob {entry(IMAGES[1]).sha256} is {state}" in problem
+    assert (decodable / "blobs" / "packs" / "00000001.pack").read_bytes() == pack
+
+
+@pytest.mark.parametrize(
+    ("statement", "reason"),
+    [
+        ("UPDATE jobs SET state = 'leased', kind = 'pregict' WHERE job_id = 's1'", "job 's1' is damaged: 'pregict'"),
+        ("UPDATE jobs SET state = 'leased', worker = CAST(x'ff' AS TEXT) WHERE job_id = 's1'", "UTF-8"),
+        ("UPDATE jobs SET state = 'leased', payload = 'text' WHERE job_id = 's1'", "a damaged row, no JobRow"),
+        ("UPDATE jobs SET not_before_s = 'soon' WHERE job_id = 's1'", "a damaged row, no JobRow"),
+        ("UPDATE meta SET value = 'x' WHERE key = 'ledger_id'", "the id of this ledger is damaged: 'x'"),
+        ("UPDATE meta SET value = x'ff' WHERE key = 'ledger_id'", "with bytes in place of str"),
+        (
+            "PRAGMA writable_schema = ON;"
+            "UPDATE sqlite_master SET name = CAST(x'ff' AS TEXT), sql = 'no' WHERE name = 'leases'",
+            "ledger.db is damaged: 'utf-8' codec can't decode byte 0xff",
+        ),
+    ],
+)
+def test_a_damaged_session_is_not_opened_and_the_reason_is_one_line(session: Path, statement: str, reason: str) -> None:
+    execute(session, statement)
+    with pytest.raises(LedgerError) as raised:
+        open_ledger(session)
+    assert reason in str(raised.value) and str(raised.value).isprintable()
+    report = check(session)
+    assert report.problems or report.repaired
+
+
+def test_damaged_rows_out_of_order_end_a_reader_that_goes_on_behind_the_last_one(session: Path) -> None:
+    ledger = open_ledger(session)
+    for index in range(3):
+        ledger.store.append(record("event", f"e{index}"))
+    ledger.close()
+    whole = (session / "ledger.db").read_bytes()
+    assert whole.count(b"event\x02\x06") == 1, "the index: stream, sequence, row"
+    (session / "ledger.db").write_bytes(whole.replace(b"event\x02\x06", b"event\x00\x06"))
+    assert "out of order" in summary_of(session).problem
+    report = check(session)
+    assert report.is_sound and "wrong index entries rebuilt" in report.repaired[0]
+    assert summary_of(session).problem == ""
+
+
+def test_a_stream_with_a_name_that_none_can_have_ends_the_service_in_one_line(session: Path) -> None:
+    execute(session, "UPDATE streams SET stream = 'key/rame' WHERE stream = 'keyframe'")
+    ledger = open_ledger(session)
+    with pytest.raises(LedgerError, match="a damaged row, of a stream 'key/rame'"):
+        ledger.store.positions()
+    ledger.close()
 
 
 def test_a_job_that_is_done_without_a_result_is_opened_again(session: Path) -> None:

@@ -14,14 +14,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ledger_helpers import damage_blob, in_pack, open_ledger, record
+from ledger_helpers import damage_blob, in_pack, open_ledger, predict, record
+from ledger_processes import keyframe
+from vggt_motion.bus.ledger import append_request
 from vggt_motion.errors import DiskFullError, LedgerError, RefusalCode, RequestRefusedError
 from vggt_motion.ledger import log, schema, sqlite
+from vggt_motion.ledger.admission import admitted
 from vggt_motion.ledger.blobs import BlobFiles
 from vggt_motion.ledger.check import check
 from vggt_motion.ledger.directory import Ledger, stored_blob
 from vggt_motion.ledger.export import export_session, import_session
-from vggt_motion.ledger.log import Append, Appended, is_intact
+from vggt_motion.ledger.log import Append, Appended, is_intact, row_digest
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
 from vggt_motion.ledger.store import (
     BlobEntry,
@@ -32,6 +35,7 @@ from vggt_motion.ledger.store import (
     Transaction,
     UnknownError,
 )
+from vggt_motion.records import JobKind
 
 
 @pytest.fixture
@@ -255,11 +259,14 @@ def test_a_directory_that_cannot_be_made_is_told_in_one_line(tmp_path: Path) -> 
 
 
 def test_a_stored_row_that_changed_is_not_intact(ledger: Ledger) -> None:
-    ledger.store.append(record("event", "a", b"x"))
+    ledger.store.append(record("event", "a", b"x"), [b"one", b"two"])
     (row,) = ledger.store.read("event")
-    assert is_intact(row)
+    references = [entry(b"one").sha256, entry(b"two").sha256]
+    assert is_intact(row, references)
     for change in ({"payload": b"y"}, {"sequence": 1}, {"stream": "graph"}, {"record_id": "b"}, {"append_time_ns": 0}):
-        assert not is_intact(type(row)(**{**row.__dict__, **change}))
+        assert not is_intact(type(row)(**{**row.__dict__, **change}), references)
+    for others in (references[:1], [], [*references, entry(b"three").sha256], None):
+        assert not is_intact(row, others)
 
 
 # Small blobs among the rows and in packs
@@ -617,6 +624,50 @@ def test_small_blobs_of_schema_3_stay_among_the_rows_and_heal_into_a_pack(
     import_session(tmp_path / "session.tar", tmp_path / "copy")
     assert check(tmp_path / "copy").is_sound
     assert [stored_blob(tmp_path / "copy", sha256) for sha256 in contents] == list(contents.values())
+
+
+def test_rows_of_schema_4_have_no_digests_and_are_verified_as_far_as_they_can_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Schema 4 had digests of records only, which did not cover the blobs that they refer to."""
+    folder, frame = tmp_path / "session", keyframe(0, b"image")
+    ledger = open_ledger(folder)
+    ledger.store.append(*admitted(append_request("keyframe", frame.keyframe_id, frame, [b"image"])))
+    (row,) = ledger.store.read("keyframe")
+    new = NewRecord(row.stream, row.record_id, row.payload_type, row.payload, row.identity_sha256)
+    ledger.jobs.submit([predict("s0"), predict("s1")])
+    assert ledger.jobs.claim([JobKind.PREDICT], [], "inference/a") is not None
+    ledger.close()
+    with monkeypatch.context() as old:
+        old.setattr(sqlite, "MIGRATIONS", schema.MIGRATIONS[:4])
+        old.setattr(sqlite, "SCHEMA_VERSION", 4)
+        SqliteRows(tmp_path / "old.db").close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "old.db")) as connection, connection:
+        connection.execute("DELETE FROM meta WHERE key = 'meta_sha256'")
+        connection.execute("ATTACH ? AS new", (str(folder / "ledger.db"),))
+        for table in ("streams", "records", "blobs", "record_blobs", "jobs", "leases"):
+            columns = ", ".join(name for _, name, *_ in connection.execute(f"PRAGMA main.table_info({table})"))
+            connection.execute(f"INSERT INTO main.{table} SELECT {columns} FROM new.{table}")
+        connection.execute("UPDATE main.records SET row_sha256 = ?", (row_digest(new, 0, row.append_time_ns, None),))
+    (tmp_path / "old.db").replace(folder / "ledger.db")
+    looked = check(folder, repair=False)
+    assert looked.is_sound and looked.repaired == (), looked
+    ledger = open_ledger(folder)
+    job, other = ledger.rows.read(lambda reader: (reader.find_job("s0"), reader.find_job("s1")))
+    assert job is not None and other is not None
+    assert job.progress_sha256 == job.progress_digest(), "it was leased and is open again"
+    assert (job.content_sha256, other.content_sha256, other.progress_sha256) == ("", "", "")
+    ledger.close()
+    assert check(folder).repaired == ()
+    with contextlib.closing(sqlite3.connect(folder / "ledger.db")) as connection, connection:
+        connection.execute("DELETE FROM record_blobs")
+    report = check(folder)
+    assert report.is_sound and report.blob_count == 1
+    assert len(report.repaired) == 1 and "was taken from the record" in report.repaired[0]
+    with contextlib.closing(sqlite3.connect(folder / "ledger.db")) as connection, connection:
+        connection.execute("UPDATE records SET payload = x'00'")
+    (problem,) = check(folder).problems
+    assert "not what was stored" in problem
 
 
 def test_a_newer_schema_is_refused_and_not_touched(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from vggt_motion.bus import calls, codec
 from vggt_motion.errors import CodecError, RefusalCode, RequestRefusedError
 from vggt_motion.ledger.log import Append
-from vggt_motion.ledger.store import Blob, BlobEntry, InvalidRequestError, NewRecord
+from vggt_motion.ledger.store import Blob, BlobEntry, InvalidRequestError, NewRecord, RecordRow
 from vggt_motion.records import (
     Constraint,
     Event,
@@ -51,6 +51,16 @@ def admitted(request: calls.AppendRequest) -> Append:
         identity_sha256=request.identity_sha256,
     )
     return Append(admitted_record, blobs, [BlobEntry(ref.sha256, ref.size_bytes) for ref in request.blob_refs])
+
+
+def referenced_blobs(row: RecordRow) -> list[BlobEntry]:
+    """The blobs that a stored record refers to, by what it says itself.
+
+    Raises:
+        CodecError: this version cannot decode it.
+    """
+    record = codec.decode(codec.record_class(row.payload_type), row.payload)
+    return [BlobEntry(ref.sha256, ref.size_bytes) for ref in codec.blob_refs(record)]
 
 
 def known_stream(name: str) -> Stream:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import time
 import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -23,7 +24,7 @@ from vggt_motion.ledger.jobs import JobPolicy, JobQueue
 from vggt_motion.ledger.log import INLINE_BYTES, PACKED_BLOB_BYTES, Store
 from vggt_motion.ledger.packs import PackFiles, read_place
 from vggt_motion.ledger.sqlite import SqliteRows, read_only
-from vggt_motion.ledger.store import NewRecord, Transaction, UnknownError
+from vggt_motion.ledger.store import NewRecord, Transaction, UnknownError, printable
 from vggt_motion.locks import try_lock
 from vggt_motion.records import JobReport
 
@@ -32,6 +33,7 @@ LOCK_NAME: Final = "session.lock"
 BLOBS_NAME: Final = "blobs"
 PACKS_NAME: Final = "blobs/packs"
 _LEDGER_ID = "ledger_id"
+_IDENTITY = re.compile(r"[0-9a-f]{32}")
 _PATIENCE_S = 0.5
 
 
@@ -180,11 +182,17 @@ class Ledger:
 
 
 def _identified(transaction: Transaction) -> str:
-    """An id that no other log has, made when this one was."""
+    """An id that no other log has, made when this one was.
+
+    Raises:
+        LedgerError: what is stored is no such id.
+    """
     known = transaction.find_meta(_LEDGER_ID)
     if known is None:
         known = uuid.uuid4().hex
         transaction.set_meta(_LEDGER_ID, known)
+    if not _IDENTITY.fullmatch(known):
+        raise LedgerError(f"the id of this ledger is damaged: '{printable(known):.40}'")
     return known
 
 

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import re
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vggt_motion.errors import DiskFullError, RequestRefusedError, VggtMotionError
+from vggt_motion.errors import DiskFullError, LedgerError, RequestRefusedError, VggtMotionError
 from vggt_motion.ledger.recent import RecentBlobs
 from vggt_motion.ledger.store import (
     Blob,
@@ -37,6 +36,8 @@ from vggt_motion.ledger.store import (
     Rows,
     Transaction,
     UnknownError,
+    digest_of,
+    printable,
     reserve_line,
     sha256_hex,
 )
@@ -495,7 +496,7 @@ class Store:
             payload=record.payload,
             identity_sha256=record.identity_sha256,
             append_time_ns=time_ns,
-            row_sha256=row_digest(record, sequence, time_ns),
+            row_sha256=row_digest(record, sequence, time_ns, [entry.sha256 for entry in prepared.entries]),
         )
         transaction.add_record(row)
         told = {entry for entry, _ in (*prepared.places, *prepared.contents)}
@@ -546,8 +547,16 @@ class Store:
         return content
 
     def positions(self) -> dict[str, int]:
-        """Next sequence number of every stream that has records."""
-        return self._rows.read(lambda reader: dict(reader.positions()))
+        """Next sequence number of every stream that has records.
+
+        Raises:
+            LedgerError: a damaged row, with a name that no stream can have.
+        """
+        positions = self._rows.read(lambda reader: dict(reader.positions()))
+        for stream in positions:
+            if not _STREAM.fullmatch(stream):
+                raise LedgerError(f"a damaged row, of a stream '{printable(stream):.40}': run a check")
+        return positions
 
     def sizes(self) -> Sizes:
         """Bytes on disk."""
@@ -654,24 +663,28 @@ def _is_valid(record: NewRecord) -> bool:
     return True
 
 
-def row_digest(record: NewRecord, sequence: int, append_time_ns: int) -> bytes:
-    """SHA-256 over all fields of a stored record, each with its length before it."""
-    digest = hashlib.sha256()
-    for part in (
-        record.stream.encode(),
-        str(sequence).encode(),
-        record.record_id.encode(),
-        record.payload_type.encode(),
+def row_digest(record: NewRecord, sequence: int, append_time_ns: int, references: Collection[str] | None) -> bytes:
+    """SHA-256 over all fields of a stored record and its references.
+
+    Args:
+        record: the record.
+        sequence: its place in its stream.
+        append_time_ns: wall clock.
+        references: SHA-256 of the blobs that it refers to; None for the digest of schema 4, which left them out.
+    """
+    return digest_of(
+        record.stream,
+        sequence,
+        record.record_id,
+        record.payload_type,
         record.payload,
         record.identity_sha256,
-        str(append_time_ns).encode(),
-    ):
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
-    return digest.digest()
+        append_time_ns,
+        *(() if references is None else (str(len(references)), *sorted(references))),
+    )
 
 
-def is_intact(row: RecordRow) -> bool:
-    """Whether a stored record still has the digest it was stored with."""
+def is_intact(row: RecordRow, references: Collection[str] | None) -> bool:
+    """Whether a stored record still has the digest it was stored with; ``references`` as for :func:`row_digest`."""
     record = NewRecord(row.stream, row.record_id, row.payload_type, row.payload, row.identity_sha256)
-    return row_digest(record, row.sequence, row.append_time_ns) == row.row_sha256
+    return row_digest(record, row.sequence, row.append_time_ns, references) == row.row_sha256

@@ -70,5 +70,12 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         "ALTER TABLE blobs ADD COLUMN pack BIGINT NOT NULL DEFAULT 0",
         "ALTER TABLE blobs ADD COLUMN offset_bytes BIGINT NOT NULL DEFAULT 0",
     ),
+    (
+        # What a check verifies rows by, as `records.row_sha256`, which covers the references from here on. Rows that
+        # were there before have none, until a job goes on.
+        "ALTER TABLE jobs ADD COLUMN content_sha256 TEXT NOT NULL DEFAULT ''",
+        "ALTER TABLE jobs ADD COLUMN progress_sha256 TEXT NOT NULL DEFAULT ''",
+        "ALTER TABLE leases ADD COLUMN row_sha256 TEXT NOT NULL DEFAULT ''",
+    ),
 )
 SCHEMA_VERSION = len(MIGRATIONS)

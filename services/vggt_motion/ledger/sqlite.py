@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import operator
 import queue
 import sqlite3
@@ -18,8 +19,21 @@ from typing import Any, TypeAlias, TypeVar
 from vggt_motion.errors import DiskFullError, LedgerError, VggtMotionError
 from vggt_motion.gathering import Gathering
 from vggt_motion.ledger.schema import MIGRATIONS, SCHEMA_VERSION
-from vggt_motion.ledger.store import BlobEntry, Content, JobRow, LeaseRow, Place, Reader, RecordRow, Transaction
-from vggt_motion.records import JobState
+from vggt_motion.ledger.store import (
+    META_SHA256,
+    BlobEntry,
+    BlobRow,
+    Content,
+    JobRow,
+    LeaseRow,
+    Place,
+    Reader,
+    RecordRow,
+    Transaction,
+    meta_digest,
+    printable,
+)
+from vggt_motion.records import JobKind, JobState
 
 T = TypeVar("T")
 
@@ -29,11 +43,28 @@ _RECORD_NAMES = tuple(field.name for field in dataclasses.fields(RecordRow))
 _RECORD_COLUMNS = ", ".join(_RECORD_NAMES)
 _ADD_RECORD = f"INSERT INTO records ({_RECORD_COLUMNS}) VALUES ({', '.join('?' * len(_RECORD_NAMES))})"
 _record_values = operator.attrgetter(*_RECORD_NAMES)
-_JOB_COLUMNS = ", ".join(field.name for field in dataclasses.fields(JobRow))
-_JOB_CONTENT = ("job_id", "submission", "kind", "model", "priority", "payload_type", "payload")
-_JOB_PROGRESS = tuple(field.name for field in dataclasses.fields(JobRow) if field.name not in _JOB_CONTENT)
+_OF_ONE_CHANGE = (
+    sqlite3.IntegrityError,
+    sqlite3.InterfaceError,
+    sqlite3.DataError,
+    sqlite3.ProgrammingError,
+    UnicodeDecodeError,
+)
+_JOB_NAMES = tuple(field.name for field in dataclasses.fields(JobRow))
+_JOB_COLUMNS = ", ".join(_JOB_NAMES)
+_job_values = operator.attrgetter(*_JOB_NAMES)
+_JOB_CONTENT = ("job_id", "submission", "kind", "model", "priority", "payload_type", "payload", "content_sha256")
+_JOB_PROGRESS = tuple(name for name in _JOB_NAMES if name not in _JOB_CONTENT)
+_UPDATE_JOB = f"UPDATE jobs SET {', '.join(f'{name} = ?' for name in _JOB_PROGRESS)} WHERE job_id = ?"
+_KIND, _STATE = _JOB_NAMES.index("kind"), _JOB_NAMES.index("state")
 _NOT_AMONG_ROWS = "is_file <> 0"  # in a file of its own, or in a pack
 _LEASE_COLUMNS = ", ".join(field.name for field in dataclasses.fields(LeaseRow))
+_BLOB_COLUMNS = ", ".join(field.name for field in dataclasses.fields(BlobRow))
+_STORAGE: Mapping[str, type] = {"str": str, "JobState": str, "int": int, "float": float, "bytes": bytes}
+_TYPES: Mapping[type[Any], tuple[type, ...]] = {
+    cls: tuple(_STORAGE[str(field.type)] for field in dataclasses.fields(cls))
+    for cls in (RecordRow, JobRow, LeaseRow, BlobRow, BlobEntry)
+}
 
 
 class _Statements:
@@ -44,42 +75,64 @@ class _Statements:
 
     def find_record(self, stream: str, record_id: str) -> RecordRow | None:
         row = self._one(f"SELECT {_RECORD_COLUMNS} FROM records WHERE stream = ? AND record_id = ?", stream, record_id)
-        return None if row is None else RecordRow(*row)
+        return None if row is None else _row(RecordRow, row)
 
     def records(self, stream: str, from_sequence: int, limit: int) -> Sequence[RecordRow]:
         statement = (
             f"SELECT {_RECORD_COLUMNS} FROM records WHERE stream = ? AND sequence >= ? ORDER BY sequence LIMIT ?"
         )
-        return [RecordRow(*row) for row in self._all(statement, stream, from_sequence, limit)]
+        rows = [_row(RecordRow, row) for row in self._all(statement, stream, from_sequence, limit)]
+        # Readers go on behind the last one: where an index says what the table does not, they would for ever.
+        if any(row.sequence < least for least, row in enumerate(rows, from_sequence)):
+            raise LedgerError(f"damaged rows: {stream} records out of order: run a check")
+        return rows
 
     def positions(self) -> Mapping[str, int]:
-        return dict(self._all("SELECT stream, next_sequence FROM streams ORDER BY stream"))
+        rows = self._all("SELECT stream, next_sequence FROM streams ORDER BY stream")
+        return {_value(str, stream): _value(int, next_sequence) for stream, next_sequence in rows}
+
+    def record_streams(self) -> Sequence[str]:
+        return self._names("SELECT DISTINCT CAST(stream AS BLOB) FROM records ORDER BY 1")
+
+    def sequences(self, stream: str) -> Sequence[int]:
+        statement = "SELECT COALESCE(CAST(sequence AS BIGINT), -1) FROM records WHERE stream = ? ORDER BY 1"
+        return [sequence for (sequence,) in self._all(statement, stream)]
 
     def find_blob(self, sha256: str) -> BlobEntry | None:
         row = self._one("SELECT sha256, size_bytes FROM blobs WHERE sha256 = ?", sha256)
-        return None if row is None else BlobEntry(*row)
+        return None if row is None else _row(BlobEntry, row)
 
     def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
         statement = """SELECT blobs.sha256, size_bytes
             FROM record_blobs JOIN blobs ON blobs.sha256 = record_blobs.sha256
             WHERE stream = ? AND sequence = ? ORDER BY blobs.sha256"""
-        return [BlobEntry(*row) for row in self._all(statement, stream, sequence)]
+        return [_row(BlobEntry, row) for row in self._all(statement, stream, sequence)]
+
+    def references(self, stream: str, sequence: int) -> Sequence[str]:
+        statement = "SELECT sha256 FROM record_blobs WHERE stream = ? AND sequence = ? ORDER BY sha256"
+        return [_value(str, sha256) for (sha256,) in self._all(statement, stream, sequence)]
+
+    def find_blob_row(self, sha256: str) -> BlobRow | None:
+        row = self._one(f"SELECT {_BLOB_COLUMNS} FROM blobs WHERE sha256 = ?", sha256)
+        return None if row is None else _row(BlobRow, row)
 
     def blob_bytes(self) -> int:
-        return int(self._value(f"SELECT COALESCE(SUM(size_bytes), 0) FROM blobs WHERE {_NOT_AMONG_ROWS}"))
+        statement = f"SELECT CAST(COALESCE(SUM(size_bytes), 0) AS BIGINT) FROM blobs WHERE {_NOT_AMONG_ROWS}"
+        return int(self._value(statement))
 
     def blobs(self) -> Iterable[tuple[BlobEntry, Place | None]]:
-        statement = f"SELECT sha256, size_bytes, pack, offset_bytes FROM blobs WHERE {_NOT_AMONG_ROWS} ORDER BY sha256"
-        for sha256, size_bytes, pack, offset_bytes in self._connection.execute(statement):
-            yield BlobEntry(sha256, size_bytes), Place(pack, offset_bytes, size_bytes) if pack else None
+        statement = f"SELECT {_BLOB_COLUMNS} FROM blobs WHERE {_NOT_AMONG_ROWS} ORDER BY sha256"
+        for row in self._connection.execute(statement):
+            blob = _row(BlobRow, row)
+            yield BlobEntry(blob.sha256, blob.size_bytes), blob.place
 
     def find_place(self, sha256: str) -> Place | None:
-        row = self._one("SELECT pack, offset_bytes, size_bytes FROM blobs WHERE sha256 = ?", sha256)
-        return Place(*row) if row is not None and row[0] else None
+        row = self.find_blob_row(sha256)
+        return None if row is None else row.place
 
     def find_content(self, sha256: str) -> bytes | None:
         row = self._one("SELECT content FROM contents WHERE sha256 = ?", sha256)
-        return None if row is None else bytes(row[0])
+        return None if row is None else _value(bytes, row[0])
 
     def has_content(self, sha256: str, size_bytes: int) -> bool:
         row = self._one("SELECT LENGTH(content) FROM contents WHERE sha256 = ?", sha256)
@@ -87,14 +140,27 @@ class _Statements:
 
     def contents(self) -> Iterable[tuple[str, bytes]]:
         for sha256, content in self._connection.execute("SELECT sha256, content FROM contents ORDER BY sha256"):
-            yield str(sha256), bytes(content)
+            yield _value(str, sha256), _value(bytes, content)
 
     def find_meta(self, key: str) -> str | None:
         row = self._one("SELECT value FROM meta WHERE key = ?", key)
-        return None if row is None else str(row[0])
+        return None if row is None else _value(str, row[0])
+
+    def meta(self) -> Mapping[str, str]:
+        return {_value(str, key): _value(str, value) for key, value in self._all("SELECT key, value FROM meta")}
 
     def find_job(self, job_id: str) -> JobRow | None:
         return self._job(f"SELECT {_JOB_COLUMNS} FROM jobs WHERE job_id = ?", job_id)
+
+    def find_job_anew(self, job_id: str) -> JobRow | None:
+        row = self._one(f"SELECT {', '.join(_JOB_CONTENT)}, state FROM jobs WHERE job_id = ?", job_id)
+        if row is None:
+            return None
+        *content, digest, state = row
+        job = dataclasses.replace(JobRow(*content), content_sha256=digest)
+        if state in (JobState.DONE, JobState.DEAD, JobState.CANCELLED):
+            job = dataclasses.replace(job, state=JobState(state))
+        return _job(_values(job))
 
     def next_open_job(self, kinds: Collection[str], models: Collection[str], now_s: float) -> JobRow | None:
         where, values = _offered(kinds, models)
@@ -104,7 +170,7 @@ class _Statements:
     def next_wake_s(self, kinds: Collection[str], models: Collection[str], now_s: float) -> float | None:
         where, values = _offered(kinds, models)
         value = self._value(f"SELECT MIN(not_before_s) FROM jobs WHERE {where} AND not_before_s > ?", *values, now_s)
-        return None if value is None else float(value)
+        return None if value is None else _value(float, value)
 
     def leased_jobs(self, worker: str | None = None, deadline_before_s: float | None = None) -> Sequence[JobRow]:
         statement = f"SELECT {_JOB_COLUMNS} FROM jobs WHERE state = ?"
@@ -119,7 +185,7 @@ class _Statements:
 
     def find_lease(self, lease_id: str) -> LeaseRow | None:
         row = self._one(f"SELECT {_LEASE_COLUMNS} FROM leases WHERE lease_id = ?", lease_id)
-        return None if row is None else LeaseRow(*row)
+        return None if row is None else _row(LeaseRow, row)
 
     def find_claim(self, worker: str, claim_id: str) -> LeaseRow | None:
         row = self._one(
@@ -128,11 +194,11 @@ class _Statements:
             worker,
             claim_id,
         )
-        return None if row is None else LeaseRow(*row)
+        return None if row is None else _row(LeaseRow, row)
 
     def job_counts(self) -> Mapping[tuple[str, str], int]:
         rows = self._all("SELECT kind, state, COUNT(*) FROM jobs GROUP BY kind, state ORDER BY kind, state")
-        return {(kind, state): count for kind, state, count in rows}
+        return {(_value(str, kind), _value(str, state)): count for kind, state, count in rows}
 
     def jobs(self, state: str | None, after_job_id: str, limit: int) -> Sequence[JobRow]:
         statement = f"SELECT {_JOB_COLUMNS} FROM jobs WHERE job_id > ?"
@@ -140,19 +206,50 @@ class _Statements:
         if state is not None:
             statement += " AND state = ?"
             values.append(state)
-        return [_job(row) for row in self._all(statement + " ORDER BY job_id LIMIT ?", *values, limit)]
+        jobs = [_job(row) for row in self._all(statement + " ORDER BY job_id LIMIT ?", *values, limit)]
+        if any(job.job_id <= after_job_id for job in jobs):
+            raise LedgerError("damaged rows: jobs out of order: run a check")
+        return jobs
+
+    def job_ids(self) -> Sequence[str]:
+        return self._names("SELECT CAST(job_id AS BLOB) FROM jobs ORDER BY job_id")
+
+    def lease_ids(self) -> Sequence[str]:
+        return self._names("SELECT CAST(lease_id AS BLOB) FROM leases ORDER BY lease_id")
 
     def next_sequence(self, stream: str) -> int:
         statement = """INSERT INTO streams (stream, next_sequence) VALUES (?, 1)
             ON CONFLICT (stream) DO UPDATE SET next_sequence = streams.next_sequence + 1 RETURNING next_sequence"""
         ((next_sequence,),) = self._all(statement, stream)
-        return int(next_sequence) - 1
+        return _value(int, next_sequence) - 1
 
     def add_record(self, row: RecordRow) -> None:
         self._run(_ADD_RECORD, *_record_values(row))
 
     def add_reference(self, stream: str, sequence: int, sha256: str) -> None:
         self._run("INSERT INTO record_blobs (stream, sequence, sha256) VALUES (?, ?, ?)", stream, sequence, sha256)
+
+    def set_references(self, stream: str, sequence: int, entries: Collection[BlobEntry]) -> None:
+        self._run("DELETE FROM record_blobs WHERE stream = ? AND sequence = ?", stream, sequence)
+        for entry in entries:
+            self.add_blob(entry)
+            self.add_reference(stream, sequence, entry.sha256)
+
+    def set_blob(self, row: BlobRow) -> None:
+        self._run(
+            f"""INSERT INTO blobs ({_BLOB_COLUMNS}) VALUES (?, ?, ?, ?, ?)
+            ON CONFLICT (sha256) DO UPDATE SET size_bytes = excluded.size_bytes, is_file = excluded.is_file,
+            pack = excluded.pack, offset_bytes = excluded.offset_bytes""",
+            *dataclasses.astuple(row),
+        )
+
+    def remove_strays(self) -> int:
+        references = self._run(
+            """DELETE FROM record_blobs WHERE NOT EXISTS (SELECT 1 FROM records
+            WHERE records.stream = record_blobs.stream AND records.sequence = record_blobs.sequence)"""
+        )
+        blobs = self._run("DELETE FROM blobs WHERE sha256 NOT IN (SELECT sha256 FROM record_blobs)")
+        return references + blobs + self._run("DELETE FROM contents WHERE sha256 NOT IN (SELECT sha256 FROM blobs)")
 
     def add_blob(self, entry: BlobEntry) -> None:
         self._run(
@@ -210,31 +307,36 @@ class _Statements:
         )
 
     def set_meta(self, key: str, value: str) -> None:
-        self._run(
-            "INSERT INTO meta (key, value) VALUES (?, ?) ON CONFLICT (key) DO UPDATE SET value = excluded.value",
-            key,
-            value,
-        )
+        statement = "INSERT INTO meta (key, value) VALUES (?, ?) ON CONFLICT (key) DO UPDATE SET value = excluded.value"
+        self._run(statement, key, value)
+        self._run(statement, META_SHA256, meta_digest(self.meta()))
 
     def add_job(self, row: JobRow) -> None:
-        submission = int(self._value("SELECT COALESCE(MAX(submission) + 1, 0) FROM jobs"))
-        values = _values(dataclasses.replace(row, submission=submission))
+        submission = _value(int, self._value("SELECT COALESCE(MAX(submission) + 1, 0) FROM jobs"))
+        row = dataclasses.replace(row, submission=submission)
+        row = dataclasses.replace(row, content_sha256=row.content_digest(), progress_sha256=row.progress_digest())
+        values = _values(row)
         self._run(f"INSERT INTO jobs ({_JOB_COLUMNS}) VALUES ({_marks(values)})", *values)
 
     def update_job(self, row: JobRow) -> None:
-        assignments = ", ".join(f"{name} = ?" for name in _JOB_PROGRESS)
+        row = dataclasses.replace(row, progress_sha256=row.progress_digest())
         values = [str(value) if isinstance(value := getattr(row, name), JobState) else value for name in _JOB_PROGRESS]
-        self._run(f"UPDATE jobs SET {assignments} WHERE job_id = ?", *values, row.job_id)
+        self._run(_UPDATE_JOB, *values, row.job_id)
 
     def shift_deadlines(self, seconds: float) -> None:
-        self._run("UPDATE jobs SET deadline_s = deadline_s + ? WHERE state = ?", seconds, JobState.LEASED.value)
+        for job in self.leased_jobs():
+            self.update_job(dataclasses.replace(job, deadline_s=job.deadline_s + seconds))
 
     def reset_times(self) -> None:
-        self._run("UPDATE jobs SET not_before_s = 0 WHERE not_before_s <> 0")
+        for row in self._all(f"SELECT {_JOB_COLUMNS} FROM jobs WHERE not_before_s <> 0"):
+            self.update_job(dataclasses.replace(_job(row), not_before_s=0.0))
 
     def add_lease(self, row: LeaseRow) -> None:
-        values = dataclasses.astuple(row)
+        values = dataclasses.astuple(dataclasses.replace(row, row_sha256=row.digest()))
         self._run(f"INSERT INTO leases ({_LEASE_COLUMNS}) VALUES ({_marks(values)})", *values)
+
+    def remove_lease(self, lease_id: str) -> bool:
+        return self._run("DELETE FROM leases WHERE lease_id = ?", lease_id) > 0
 
     def _run(self, statement: str, *values: Any) -> int:
         """Carry out a statement; returns the number of rows that it changed."""
@@ -251,18 +353,43 @@ class _Statements:
         row = self._one(statement, *values)
         return None if row is None else row[0]
 
+    def _names(self, statement: str) -> list[str]:
+        """Names that were asked for as bytes: what is no text any more is still a row."""
+        return [(name or b"").decode(errors="replace") for (name,) in self._all(statement)]
+
     def _job(self, statement: str, *values: Any) -> JobRow | None:
         row = self._one(statement, *values)
         return None if row is None else _job(row)
 
 
-def _job(row: tuple[Any, ...]) -> JobRow:
-    job = JobRow(*row)
-    return dataclasses.replace(job, state=JobState(job.state))
+def _row(cls: type[T], values: tuple[Any, ...]) -> T:
+    _check_types(cls, values)
+    return cls(*values)
+
+
+def _check_types(cls: type[Any], values: tuple[Any, ...]) -> None:
+    if tuple(map(type, values)) != _TYPES[cls]:
+        raise LedgerError(f"a damaged row, no {cls.__name__}: run a check")
+
+
+def _value(cls: type[T], value: Any) -> T:
+    if type(value) is not cls:
+        raise LedgerError(f"a damaged row, with {type(value).__name__} in place of {cls.__name__}: run a check")
+    return value
+
+
+def _job(values: tuple[Any, ...]) -> JobRow:
+    _check_types(JobRow, values)
+    try:
+        JobKind(values[_KIND])
+        known = [*values[:_STATE], JobState(values[_STATE]), *values[_STATE + 1 :]]
+    except ValueError as error:
+        raise LedgerError(f"the row of job '{values[0]}' is damaged: {error}; run a check") from None
+    return JobRow(*known)
 
 
 def _values(row: JobRow) -> tuple[Any, ...]:
-    return tuple(str(value) if isinstance(value, JobState) else value for value in dataclasses.astuple(row))
+    return tuple(str(value) if isinstance(value, JobState) else value for value in _job_values(row))
 
 
 def _marks(values: Sequence[Any]) -> str:
@@ -389,8 +516,8 @@ class SqliteRows:
     def _outcome(self, change: Callable[[Transaction], T]) -> T | Exception:
         try:
             return change(self._statements)
-        except (sqlite3.IntegrityError, sqlite3.InterfaceError, sqlite3.DataError, sqlite3.ProgrammingError) as error:
-            return LedgerError(f"{self._path}: {error}")
+        except _OF_ONE_CHANGE as error:
+            return LedgerError(f"{self._path}: {printable(str(error))}")
         except sqlite3.Error:
             # Full or failing storage may have ended the whole transaction: nobody in it is acknowledged.
             raise
@@ -435,15 +562,43 @@ def read_only(path: Path) -> Iterator[Reader]:
 
 
 def integrity_problems(path: Path) -> list[str]:
-    """What SQLite itself finds wrong with the file, its indexes and references; empty if sound."""
-    try:
-        with contextlib.closing(connect(path)) as connection:
-            found = [str(row[0]) for row in connection.execute("PRAGMA integrity_check(100)")]
-            for table, row, parent, _ in connection.execute("PRAGMA foreign_key_check"):
-                found.append(f"{table} row {row}: no such row in {parent}")
-    except sqlite3.Error as error:
-        return [str(error)]
+    """What SQLite itself finds wrong with the file and its indexes; empty if sound.
+
+    Raises:
+        LedgerError: so much that it cannot look.
+    """
+    with _errors_of(path), contextlib.closing(connect(path)) as connection:
+        found = [str(row[0]) for row in connection.execute("PRAGMA integrity_check(100)")]
     return [line for line in found if line != "ok"]
+
+
+def schema_problems(path: Path) -> list[str]:
+    """Tables and indexes that are not there, or not as they were made, one line each.
+
+    Raises:
+        LedgerError: so much that it cannot look.
+    """
+    statement = "SELECT type, name, tbl_name, sql FROM sqlite_master"
+    with (
+        _errors_of(path),
+        contextlib.closing(connect(path, is_read_only=True)) as connection,
+        contextlib.closing(sqlite3.connect(":memory:")) as model,
+    ):
+        for change in itertools.chain.from_iterable(MIGRATIONS):
+            model.execute(change)
+        missing = set(model.execute(statement)) - set(connection.execute(statement))
+    return sorted(f"{kind} {name} is not as it was made" for kind, name, *_ in missing)
+
+
+def dangling_references(path: Path) -> list[str]:
+    """Rows that refer to others that are not there, one line each.
+
+    Raises:
+        LedgerError: the tables themselves are damaged.
+    """
+    with _errors_of(path), contextlib.closing(connect(path)) as connection:
+        found = connection.execute("PRAGMA foreign_key_check").fetchall()
+    return [f"{table} row {row}: no such row in {parent}" for table, row, parent, _ in found]
 
 
 def rebuild_indexes(path: Path) -> None:
@@ -531,8 +686,10 @@ def _errors_of(path: Path) -> Iterator[None]:
         yield
     except VggtMotionError:
         raise
+    except UnicodeDecodeError as error:  # SQLite's message quotes what is no text any more
+        raise LedgerError(f"{path} is damaged: {error}") from error
     except sqlite3.Error as error:
         code = getattr(error, "sqlite_errorcode", None)
         if code is not None and code & 0xFF == sqlite3.SQLITE_FULL:
             raise DiskFullError(f"no space for the rows of {path}") from error
-        raise LedgerError(f"{path}: {error}") from error
+        raise LedgerError(f"{path}: {printable(str(error))}") from error

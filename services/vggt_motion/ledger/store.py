@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from vggt_motion.errors import RefusalCode, RequestRefusedError
 from vggt_motion.records import JobState
@@ -21,6 +21,8 @@ from vggt_motion.records import JobState
 T = TypeVar("T")
 Content: TypeAlias = bytes | memoryview
 """Of a blob; a view is into the request that it came with."""
+META_SHA256: Final = "meta_sha256"
+"""The fact about a session that says what all the others are, see :func:`meta_digest`."""
 
 
 class InvalidRequestError(RequestRefusedError):
@@ -63,6 +65,22 @@ class Place:
 
 
 @dataclass(frozen=True)
+class BlobRow:
+    """A blob as it is stored."""
+
+    sha256: str
+    size_bytes: int
+    is_file: int  # 0: its content stands among the rows; 1: in a file of its own, or in a pack
+    pack: int = 0  # from 1; 0: in none
+    offset_bytes: int = 0  # in the pack
+
+    @property
+    def place(self) -> Place | None:
+        """Where it lies if it is in a pack."""
+        return Place(self.pack, self.offset_bytes, self.size_bytes) if self.pack else None
+
+
+@dataclass(frozen=True)
 class Blob:
     """Bytes with their hash, so that it is computed once on their way through the ledger."""
 
@@ -99,7 +117,7 @@ class RecordRow:
     payload: bytes
     identity_sha256: bytes
     append_time_ns: int  # wall clock, informative
-    row_sha256: bytes  # over all the fields above: what `ledger check` verifies
+    row_sha256: bytes  # over all the fields above and the blobs it refers to: what `ledger check` verifies
 
 
 @dataclass(frozen=True)
@@ -123,6 +141,20 @@ class JobRow:
     not_before_s: float = 0.0  # back-off after a failure
     last_reason: str = ""
     last_traceback: str = ""
+    content_sha256: str = ""  # the store keeps both; empty: not written since schema 4
+    progress_sha256: str = ""
+
+    def content_digest(self) -> str:
+        """SHA-256 over what never changes."""
+        content = (self.job_id, self.submission, self.kind, self.model, self.priority, self.payload_type, self.payload)
+        return digest_of(*content).hex()
+
+    def progress_digest(self) -> str:
+        """SHA-256 over the rest."""
+        counts = (self.attempt, self.failure_count, self.lost_lease_count)
+        times = (self.deadline_s, self.not_before_s)
+        texts = (self.lease_id, self.worker, self.last_reason, self.last_traceback)
+        return digest_of(self.job_id, self.state, *counts, *times, *texts).hex()
 
 
 @dataclass(frozen=True)
@@ -134,10 +166,15 @@ class LeaseRow:
     worker: str
     claim_id: str
     attempt: int
+    row_sha256: str = ""  # the store keeps it; empty: of schema 4 or older
+
+    def digest(self) -> str:
+        """SHA-256 over all the fields but this one."""
+        return digest_of(self.lease_id, self.job_id, self.worker, self.claim_id, self.attempt).hex()
 
 
 class Reader(Protocol):
-    """Committed rows."""
+    """Committed rows. Every question raises LedgerError when a row that answers it is damaged so that it shows."""
 
     def find_record(self, stream: str, record_id: str) -> RecordRow | None:
         """The record with this id."""
@@ -148,11 +185,23 @@ class Reader(Protocol):
     def positions(self) -> Mapping[str, int]:
         """Next sequence number of every stream that has records."""
 
+    def record_streams(self) -> Sequence[str]:
+        """The streams that the records themselves name."""
+
+    def sequences(self, stream: str) -> Sequence[int]:
+        """The sequence numbers of all records of a stream, in order."""
+
     def find_blob(self, sha256: str) -> BlobEntry | None:
         """The blob, if a record refers to it."""
 
     def record_blobs(self, stream: str, sequence: int) -> Sequence[BlobEntry]:
         """The blobs that a record refers to."""
+
+    def references(self, stream: str, sequence: int) -> Sequence[str]:
+        """SHA-256 of the blobs that a record refers to, in order, whether there are such blobs or not."""
+
+    def find_blob_row(self, sha256: str) -> BlobRow | None:
+        """All that is stored of a blob."""
 
     def blob_bytes(self) -> int:
         """Sum of the sizes of the blobs whose content is not among the rows."""
@@ -175,8 +224,14 @@ class Reader(Protocol):
     def find_meta(self, key: str) -> str | None:
         """A fact about the session."""
 
+    def meta(self) -> Mapping[str, str]:
+        """All facts about the session."""
+
     def find_job(self, job_id: str) -> JobRow | None:
         """The job with this id."""
+
+    def find_job_anew(self, job_id: str) -> JobRow | None:
+        """The job with this id as if it had not begun, whatever is damaged of how far it has come; ended if it is."""
 
     def next_open_job(self, kinds: Collection[str], models: Collection[str], now_s: float) -> JobRow | None:
         """The first open job by (priority, submission) that fits an offer and whose back-off is over.
@@ -203,6 +258,12 @@ class Reader(Protocol):
     def jobs(self, state: str | None, after_job_id: str, limit: int) -> Sequence[JobRow]:
         """Jobs in order of id."""
 
+    def job_ids(self) -> Sequence[str]:
+        """The ids of all jobs, in order; of a damaged one as much as can be read."""
+
+    def lease_ids(self) -> Sequence[str]:
+        """The ids of all leases, in order; of a damaged one as much as can be read."""
+
 
 class Transaction(Reader, Protocol):
     """One atomic change; reads see its own writes."""
@@ -215,6 +276,15 @@ class Transaction(Reader, Protocol):
 
     def add_reference(self, stream: str, sequence: int, sha256: str) -> None:
         """Say that a record refers to a blob; both are there."""
+
+    def set_references(self, stream: str, sequence: int, entries: Collection[BlobEntry]) -> None:
+        """Say that a record refers to these blobs and no others; those that are not known become so."""
+
+    def set_blob(self, row: BlobRow) -> None:
+        """Insert a blob, or replace all that is stored of it but its content."""
+
+    def remove_strays(self) -> int:
+        """Forget references of no record, blobs that no record refers to, and contents of no blob; returns how many."""
 
     def add_blob(self, entry: BlobEntry) -> None:
         """Insert a blob whose content is durable, unless it is known."""
@@ -232,7 +302,7 @@ class Transaction(Reader, Protocol):
         """Forget where a blob lies, if that still is its place."""
 
     def set_meta(self, key: str, value: str) -> None:
-        """Insert or replace a fact about the session."""
+        """Insert or replace a fact about the session, and what says what all of them are."""
 
     def add_job(self, row: JobRow) -> None:
         """Insert a job; its ``submission`` is replaced by the next one."""
@@ -248,6 +318,9 @@ class Transaction(Reader, Protocol):
 
     def add_lease(self, row: LeaseRow) -> None:
         """Insert a lease."""
+
+    def remove_lease(self, lease_id: str) -> bool:
+        """Forget that a lease was handed out; False: it is not known."""
 
 
 class Rows(Protocol):
@@ -337,6 +410,26 @@ class Packs(Protocol):
 def sha256_hex(data: Content) -> str:
     """SHA-256 as 64 lower-case hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
+
+
+def digest_of(*values: str | float | Content) -> bytes:
+    """SHA-256 over values, each with its length before it."""
+    digest = hashlib.sha256()
+    for value in values:
+        part = str(value).encode() if isinstance(value, (str, int, float)) else value
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.digest()
+
+
+def meta_digest(facts: Mapping[str, str]) -> str:
+    """SHA-256 over all facts about a session but the one that holds it."""
+    return digest_of(*(text for key in sorted(facts) if key != META_SHA256 for text in (key, facts[key]))).hex()
+
+
+def printable(text: str) -> str:
+    """Foreign text as one line that a terminal can show."""
+    return "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
 
 
 def reserve_line(free_bytes: int, keep_free_bytes: int) -> str:
