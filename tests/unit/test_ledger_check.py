@@ -89,7 +89,7 @@ def test_what_an_interrupted_write_left_is_repaired(session: Path) -> None:
     assert report.is_sound
     assert "1 unfinished blob writes removed" in report.repaired
     assert not (session / "blobs" / "incoming" / "torn.0").exists()
-    assert any("1 blobs of writes that were never acknowledged" in line for line in report.repaired)
+    assert any("1 blobs to which no record refers set aside" in line for line in report.repaired)
     assert not blob_path(session, b"written, but its row never was").exists()
     assert check(session).repaired == ()
 
@@ -580,3 +580,16 @@ def test_archives_that_are_not_ours_are_refused_and_leave_nothing(session: Path,
             tar.addfile(info, io.BytesIO(b"x"))
         refused(buffer.getvalue())
     assert not (tmp_path / "escape").exists()
+
+
+def test_of_an_emptied_database_the_payloads_are_kept(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    ledger = open_ledger(session, packed_blob_bytes=100)
+    ledger.store.append(record("keyframe", "a"), [b"image"], [entry(b"image")])
+    ledger.close()
+    pack = (session / "blobs" / "packs" / "00000001.pack").read_bytes()
+    for file in session.glob("ledger.db*"):
+        file.write_bytes(b"")
+    assert check(session, repair=False).repaired == check(session).repaired != ()
+    (kept,) = (session / "blobs" / "damaged").iterdir()
+    assert kept.read_bytes() == pack

@@ -439,7 +439,7 @@ def test_a_result_without_one_of_its_blobs_leaves_the_job_leased(ledger: Ledger)
     ledger.jobs.submit([predict("a")])
     lease = claim(ledger)
     missing = ledger.blobs.put([b"x"], keep_free_bytes=0)
-    ledger.blobs.remove(missing[0].sha256)
+    ledger.blobs.set_aside(missing[0].sha256)
     with pytest.raises(UnknownError):
         ledger.jobs.done("a", lease.lease_id, record("submap", "a"), [], missing)
     assert state(ledger) is JobState.LEASED

@@ -404,7 +404,7 @@ def test_a_refused_record_leaves_no_content_behind(tmp_path: Path) -> None:
         ledger.store.blob(entry(b"new").sha256)
     ledger.close()
     report = check(tmp_path / "session")
-    assert report.repaired == ("4096 bytes of writes that were never acknowledged removed from pack 1",)
+    assert report.repaired == ("4096 bytes at the end of pack 1, to which no record refers, set aside",)
     assert check(tmp_path / "session").repaired == ()
 
 

@@ -149,10 +149,6 @@ class BlobFiles:
             return error.strerror or str(error)
         return "" if sha256_hex(data) == sha256 else "another content"
 
-    def remove(self, sha256: str) -> None:
-        """Delete a file that no record refers to."""
-        self._path(sha256).unlink()
-
     def set_aside(self, sha256: str) -> None:
         """Move a damaged file to ``damaged/``, where a person can look at it."""
         path = self._path(sha256)
@@ -161,13 +157,15 @@ class BlobFiles:
             make_folder(self._damaged, self._files)
             self._files.rename(path, self._damaged / sha256)
 
-    def keep_damaged(self, sha256: str, data: bytes) -> None:
-        """Write a damaged content that was no file to ``damaged/`` as well."""
+    def keep_damaged(self, sha256: str, data: bytes) -> bool:
+        """Write a content that was no file to ``damaged/`` as well; False: it cannot be written."""
         path = self._damaged / self._path(sha256).name
         _LOGGER.error("blob %s is damaged; kept as %s", sha256, path)
         with contextlib.suppress(OSError):
             make_folder(self._damaged, self._files)
             path.write_bytes(data)
+            return True
+        return False
 
     def _path(self, sha256: str) -> Path:
         # The name comes from outside: it must never lead out of the folder.

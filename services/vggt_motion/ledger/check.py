@@ -46,6 +46,7 @@ from vggt_motion.ledger.store import (
 from vggt_motion.records import JobState
 
 _MAX_LISTED = 100
+_MOST_SET_ASIDE_BYTES = 256 * 2**20
 _LOG_NAME = f"{DATABASE_NAME}-wal"
 
 
@@ -411,17 +412,22 @@ class _Check:
         orphans = [sha256 for sha256 in self._blobs.names() if sha256 not in self._referenced]
         if orphans:
             size_bytes = sum(self._blobs.size_bytes(sha256) for sha256 in orphans)
-            line = f"{len(orphans)} blobs of writes that were never acknowledged removed ({size_bytes} bytes)"
-            self._findings.repair(line)
+            self._findings.repair(f"{len(orphans)} blobs to which no record refers set aside ({size_bytes} bytes)")
         for sha256 in orphans if self._repair_files else ():
-            self._blobs.remove(sha256)
-        # What was written behind the last blob that a row knows was never acknowledged either.
+            self._blobs.set_aside(sha256)
+        # What lies behind the last blob that a row knows was not acknowledged either, or its rows are lost: who cut off
+        # the end of the write-ahead log, or emptied the database, must not lose the payloads as well.
         used = self._rows.read(lambda reader: [place for _, place in reader.blobs() if place is not None])
         for number, size_bytes in self._packs.unused_bytes(used).items():
-            line = f"{size_bytes} bytes of writes that were never acknowledged removed from pack {number}"
+            if size_bytes > _MOST_SET_ASIDE_BYTES:
+                self._findings.problem(f"{size_bytes} bytes at the end of pack {number} to which no record refers")
+                continue
+            line = f"{size_bytes} bytes at the end of pack {number}, to which no record refers, set aside"
             self._findings.repair(line)
             if self._repair_files:
-                self._packs.cut_off(number, size_bytes)
+                rest = self._packs.last_bytes(number, size_bytes)
+                if self._blobs.keep_damaged(sha256_hex(rest), rest):
+                    self._packs.cut_off(number, size_bytes)
 
 
 def _record_and_references(reader: Reader, stream: str, sequence: int) -> tuple[RecordRow | None, Sequence[str]]:

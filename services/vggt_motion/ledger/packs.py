@@ -188,6 +188,10 @@ class PackFiles:
         path = self._path(number)
         os.truncate(path, path.stat().st_size - byte_count)
 
+    def last_bytes(self, number: int, byte_count: int) -> bytes:
+        """The last bytes of a pack."""
+        return self.read(Place(number, self._path(number).stat().st_size - byte_count, byte_count))
+
     def close(self) -> None:
         """Close the files for good: the session may be somebody else's from now on."""
         with self._lock:

@@ -382,8 +382,8 @@ class Blobs(Protocol):
     def free_bytes(self) -> int:
         """Space left for more."""
 
-    def keep_damaged(self, sha256: str, data: bytes) -> None:
-        """Keep a content that is not what it was where a person can look at it."""
+    def keep_damaged(self, sha256: str, data: bytes) -> bool:
+        """Keep a content that is not what it was where a person can look at it; False: it cannot be written."""
 
 
 class Writing(NamedTuple):
