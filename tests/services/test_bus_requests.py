@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import gc
 import threading
 import time
+import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -29,6 +31,7 @@ from vggt_motion.bus.session import Bus, EndpointTakenError, open_bus, zenoh_con
 from vggt_motion.errors import (
     BusError,
     BusUnavailableError,
+    CodecError,
     ConfigurationError,
     DiskFullError,
     RefusalCode,
@@ -201,6 +204,76 @@ def test_a_batch_ends_before_it_grows_too_large_and_a_defect_refuses_all_of_it(e
                 with pytest.raises(RequestRefusedError, match="internal error: ValueError"):
                     future.result(30)
     assert sum(batches) == 72 * 2**20 and max(batches) <= 32 * 2**20
+
+
+class Content:
+    """What a handler makes of a request."""
+
+
+@pytest.mark.parametrize("is_together", [False, True])
+def test_what_a_refused_request_took_in_memory_is_let_go_at_once(endpoint: str, is_together: bool) -> None:
+    contents: weakref.WeakSet[Content] = weakref.WeakSet()
+
+    def handler(_: str, payload: bytes) -> bytes:
+        content = Content()
+        contents.add(content)
+        try:
+            raise ValueError(payload)
+        except ValueError as error:
+            raise CodecError(f"{content} cannot be read") from error
+
+    def why_not(payload: bytes) -> Exception:
+        try:
+            handler("", payload)
+        except CodecError as error:
+            return error
+        raise AssertionError
+
+    def handler_of_many(payloads: Sequence[bytes]) -> list[bytes | Exception]:
+        outcomes = [why_not(payload) for payload in payloads]  # each leads to this frame, and the frame to each
+        return list(outcomes)
+
+    with connect(endpoint) as server, connect(endpoint) as client:
+        key = server.keys.rpc("test", "refuse")
+        if is_together:
+            server.serve_together(key, handler_of_many, at_a_time=8)
+            wait_until_served(client, key)
+        else:
+            serve(server, key, handler, asker=client)
+        gc.collect()
+        gc.disable()
+        try:
+            with pytest.raises(RequestRefusedError, match="cannot be read"):
+                client.request(key, b"")
+            wait_until(lambda: not contents, 10.0)
+        finally:
+            gc.enable()
+
+
+def test_what_is_longer_than_all_that_may_wait_is_for_the_handler_to_refuse(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vggt_motion.bus.serving._MAX_PENDING_BYTES", 1000)
+    release = threading.Event()
+
+    def handler(_: str, payload: bytes) -> bytes:
+        if payload == b"wait":
+            assert release.wait(30)
+            return b""
+        raise CodecError(f"{len(payload)} bytes are more than the allowed 500")
+
+    with connect(endpoint) as server, connect(endpoint) as client, ThreadPoolExecutor(1) as pool:
+        key = server.keys.rpc("test", "measure")
+        served = serve(server, key, handler, asker=client)
+        with pytest.raises(RequestRefusedError, match="1001 bytes are more than the allowed 500"):
+            client.request(key, bytes(1001))
+        wait_until(lambda: served._held_bytes == 0)  # type: ignore[attr-defined]
+        waiting = pool.submit(client.request, key, b"wait")
+        wait_until(lambda: served._held_bytes == 4)  # type: ignore[attr-defined]
+        with pytest.raises(BusUnavailableError, match="overloaded, try again later"):
+            client.request(key, bytes(1001))
+        release.set()
+        assert waiting.result(30) == b""
 
 
 def test_what_one_client_asks_at_a_time_travels_together_and_each_gets_its_own(endpoint: str) -> None:

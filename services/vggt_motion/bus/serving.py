@@ -138,7 +138,9 @@ class Server:
         attachment = _attachment_of(query)
         size_bytes = len(query.payload) if query.payload is not None else 0
         size_bytes += self._parcels.size_bytes(attachment)
-        is_full = len(self._waiting) >= _MAX_PENDING or self._held_bytes + size_bytes > _MAX_PENDING_BYTES
+        # What is longer than all that may wait comes in alone: it is not to be sent again, and the handler says so.
+        is_too_much = self._held_bytes > 0 and self._held_bytes + size_bytes > _MAX_PENDING_BYTES
+        is_full = len(self._waiting) >= _MAX_PENDING or is_too_much
         if is_full or self.is_closed:
             return False
         self._held_bytes += size_bytes
@@ -240,6 +242,9 @@ class Server:
 
     def _refusal(self, key: str, error: Exception, request_bytes: int) -> calls.Refusal:
         if isinstance(error, VggtMotionError):
+            # Its traceback holds the request, and by way of who called whom itself: several times its length in memory,
+            # until Python looks for cycles.
+            error.__traceback__ = error.__cause__ = error.__context__ = None
             return _as_refusal(refusal_code(error), str(error))
         _log.error("a request ended in a defect of ours", extra={"key": key, "bytes": request_bytes}, exc_info=error)
         return _as_refusal(RefusalCode.INTERNAL, f"internal error: {type(error).__name__}")
