@@ -155,6 +155,39 @@ def test_a_frame_that_hides_its_size_is_refused() -> None:
         decode_depth(header + struct.pack("<I", zlib.crc32(header)) + frame)
 
 
+def test_a_frame_that_lies_about_its_size_is_refused_before_it_is_unpacked() -> None:
+    # 8192 blocks of one byte 128 KiB times each, and a header that says 36 bytes (RFC 8878).
+    block, last = ((2**17 << 3 | 1 << 1 | is_last).to_bytes(3, "little") + b"\0" for is_last in (0, 1))
+    frame = b"\x28\xb5\x2f\xfd\xc0\x38" + struct.pack("<Q", 36) + block * 8191 + last
+    with pytest.raises(CodecError, match="Destination buffer is too small"):
+        decode_depth(blob(4, 3, bytes(36))[:HEADER_BYTES] + frame)
+
+
+halves = st.one_of(st.just(0), st.integers(0x0400, 0x7BFF), st.integers(0, 0xFFFF))
+
+
+@given(
+    bits=hnp.arrays(np.uint16, (3, 4), elements=halves),
+    levels=hnp.arrays(np.uint8, (3, 4)),
+    exponent=st.integers(-9, 9),
+)
+def test_any_bits_are_depth_or_refused_for_their_values(bits: np.ndarray, levels: np.ndarray, exponent: int) -> None:
+    planes = bits.astype("<u2").view(np.uint8).reshape(-1, 2)
+    payload = blob(4, 3, planes[:, 0].tobytes() + planes[:, 1].tobytes() + levels.tobytes(), exponent=exponent)
+    values = bits.view(np.float16).astype(np.float64)
+    is_positive = np.isfinite(values) & (values >= 2.0**-14)
+    if not np.all(is_positive | (bits == 0)):
+        with pytest.raises(CodecError, match="depth must be finite, not negative"):
+            decode_depth(payload)
+    elif np.any((bits == 0) & (levels > 0)):
+        with pytest.raises(CodecError, match="confidence without depth"):
+            decode_depth(payload)
+    else:
+        depth, confidence = decode_depth(payload)
+        assert np.array_equal(depth, values * 2.0**exponent)
+        assert np.allclose(confidence, levels / 255.0, atol=1e-6)
+
+
 @settings(max_examples=200)
 @given(st.data())
 def test_damage_in_many_places_ends_in_one_error(data: st.DataObject) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,9 @@ from vggt_motion.ledger.directory import Ledger
 from vggt_motion.ledger.service import Desk, Presence, dead_event, open_session
 from vggt_motion.records import Event, EventKind, JobKind, JobReport, JobState, Stream
 
-# `make test-faults` asks for 20,000.
-CASES = int(os.environ.get("VGGT_MOTION_FUZZ_CASES", "300"))
+# Many more, and told apart by what is wrong with them, are in tests/services/faults/test_hostile_bytes.py.
 FUZZ = settings(
-    max_examples=CASES, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 DEPTH = depth_blob(0)
 

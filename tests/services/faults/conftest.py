@@ -17,14 +17,17 @@ from bus_processes import free_port
 SEED_VARIABLE = "VGGT_MOTION_FAULT_SEED"
 _TABLE = pytest.StashKey[dict[str, list[Outcome]]]()
 _SEED = pytest.StashKey[int]()
+_HOSTILE = pytest.StashKey[dict[tuple[str, str], Counter[str]]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_TABLE] = defaultdict(list)
+    config.stash[_HOSTILE] = defaultdict(Counter)
     config.stash[_SEED] = int(os.environ.get(SEED_VARIABLE, "0")) or random.SystemRandom().randrange(1, 2**31)
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    _write_hostile(terminalreporter, config)
     table = config.stash[_TABLE]
     if not table:
         return
@@ -58,6 +61,25 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     write(_line("all", total, "yes" if all(o.is_equal for outcomes in table.values() for o in outcomes) else "NO"))
 
 
+def _write_hostile(terminalreporter: Any, config: pytest.Config) -> None:
+    table = config.stash[_HOSTILE]
+    if not table:
+        return
+    write = terminalreporter.write_line
+    terminalreporter.section("hostile bytes")
+    write(f"seed {config.stash[_SEED]} (repeat with {SEED_VARIABLE})")
+    columns = {
+        "cases": "cases",
+        "unparsed": "no message",
+        "content": "refused by content",
+        "taken": "taken",
+        "live": "live",
+    }
+    write(f"{'entry':<8}{'kind':<22}" + "".join(f"{title:>20}" for title in columns.values()))
+    for (entry, kind), counts in table.items():
+        write(f"{entry:<8}{kind:<22}" + "".join(f"{counts[column]:>20}" for column in columns))
+
+
 def _line(name: str, figures: Any, is_equal: str) -> str:
     return (
         f"{name:<36}{figures['injected']:>9}{figures['runs']:>6}{figures['acknowledged']:>9}{figures['lost']:>6}"
@@ -79,6 +101,12 @@ def judge(request: pytest.FixtureRequest) -> Callable[[str, Outcome], Outcome]:
         return outcome
 
     return enter
+
+
+@pytest.fixture
+def tally(request: pytest.FixtureRequest) -> Callable[[str, str], Counter[str]]:
+    """What became of the hostile messages to an entry, by kind; for the table at the end."""
+    return lambda entry, kind: request.config.stash[_HOSTILE][entry, kind]
 
 
 @pytest.fixture
