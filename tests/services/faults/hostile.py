@@ -193,6 +193,20 @@ def _change_size(owner: Message, field: FieldDescriptor, pick: Pick) -> None:
         values.extend([float(pick(100)) for _ in range(1 + pick(20))])
 
 
+# Elements that cannot be 2 and more, or negative, whatever the others are; rows of 3, 4 and 7.
+TURNS = {"rotation": range(9), "submap_from_camera": [0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, 15]}
+DIAGONAL = range(0, 49, 8)
+
+
+def _bend(owner: Message, field: FieldDescriptor, pick: Pick) -> None:
+    values = getattr(owner, field.name)
+    if field.name in TURNS:
+        places = TURNS[field.name]
+        values[places[pick(len(places))]] = 2.0 + pick(1000)
+    else:
+        values[DIAGONAL[pick(7)]] = -1.0 - pick(1000)
+
+
 def _may_be_other(owner: Message, field: FieldDescriptor, value: Any) -> bool:
     match field.type:
         case FieldDescriptor.TYPE_UINT32:
@@ -270,6 +284,11 @@ SPOILS = {
         r"must not be NaN|must be finite|needs finite|is -inf, allowed",
     ),
     "wrong shape": Spoil(_is_wrong_size, _change_size, r"has \d+ numbers, \d+ are needed"),
+    "wrong geometry": Spoil(
+        lambda owner, field, _: field.name in {*TURNS, "information"},
+        _bend,
+        "is not a rotation|must have the last row 0 0 0 1|has a negative diagonal",
+    ),
     "wrong value": Spoil(
         _may_be_other,
         _change_to_other,
@@ -617,6 +636,7 @@ def request_kinds(wrap: Callable[[ledger_pb2.AppendRequest], Message], among: li
         "oversized": oversized,
         **{kind: with_depth(*made) for kind, made in DEPTH_KINDS.items()},
         "wrong shape": wrong_shape,
+        "wrong geometry": spoiled_somewhere(SPOILS["wrong geometry"]),
         "no number": spoiled_somewhere(SPOILS["no number"]),
         "wrong value": spoiled_somewhere(SPOILS["wrong value"]),
         "missing part": spoiled_somewhere(SPOILS["missing part"]),
