@@ -159,8 +159,6 @@ def start(fault_sample: Path, small_reference: tuple[Path, Snapshot], tmp_path: 
     def begin(
         *assignments: str, seconds_per_submap: float = 0.5, seconds_per_frame: float = 0.0, **options: Any
     ) -> FaultRun:
-        if seconds_per_frame:
-            options["environment"] = with_hook(HERE / "pace", PACE_S_PER_FRAME=str(seconds_per_frame))
         run = FaultRun(
             source=options.pop("source", fault_sample),
             out=options.pop("out", tmp_path / f"run{len(runs)}"),
@@ -173,6 +171,7 @@ def start(fault_sample: Path, small_reference: tuple[Path, Snapshot], tmp_path: 
                 *assignments,
             ),
             port=options.pop("port", 0) or free_port(),
+            **_paced(seconds_per_frame),
             **options,
         )
         runs.append(run)
@@ -183,19 +182,25 @@ def start(fault_sample: Path, small_reference: tuple[Path, Snapshot], tmp_path: 
         run.stop()
 
 
+def _paced(seconds_per_frame: float) -> dict[str, Any]:
+    if not seconds_per_frame:
+        return {}
+    return {"environment": with_hook(HERE / "pace", PACE_S_PER_FRAME=str(seconds_per_frame))}
+
+
 @pytest.fixture
 def start_sfm(fault_sample: Path, sfm_reference: Snapshot, tmp_path: Path) -> Iterator[Start]:
     """Start a run as it is shipped."""
     runs: list[FaultRun] = []
 
-    def begin(*assignments: str, **options: Any) -> FaultRun:
+    def begin(*assignments: str, seconds_per_frame: float = 0.0) -> FaultRun:
         run = FaultRun(
-            source=options.pop("source", fault_sample),
+            source=fault_sample,
             out=tmp_path / f"run{len(runs)}",
             reference=sfm_reference,
             assignments=assignments,
             port=free_port(),
-            **options,
+            **_paced(seconds_per_frame),
         )
         runs.append(run)
         return run
