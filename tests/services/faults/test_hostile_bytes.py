@@ -180,6 +180,7 @@ class Target:
         return {lease.job.job_id: lease for lease in leases if lease is not None}
 
     def next_header(self) -> bytes:
+        """Of a frame that the frontend takes from the bus: it numbers them in the same way."""
         return hostile.image_header(next(self._indices))
 
     def show(self, count: int) -> None:
@@ -188,10 +189,13 @@ class Target:
             self.camera.put(encode_image(frame, "front"), attachment=self.next_header())
         self.taken_images += count
         self.recorded_images += count
-        wait_for(lambda: self.counter(self.recorder, "frames") == self.recorded_images, "the recording")
-        wait_for(lambda: self.counter(self.frontend, "frames") == self.taken_images, "the frontend")
+        wait_for(self._has_all_frames, "all frames")
         wait_for(self._is_all_sent, "the frontend's keyframes")
         self.before = self._state()
+
+    def _has_all_frames(self) -> bool:
+        counts = (self.counter(self.frontend, "frames"), self.counter(self.recorder, "frames"))
+        return counts == (self.taken_images, self.recorded_images)
 
     def _is_all_sent(self) -> bool:
         status = self.session.ledger.status()
@@ -220,6 +224,7 @@ class Target:
             assert service.process.poll() is None
             assert "Traceback" not in service.text()
         wait_for(lambda: self._metrics() == self._expected_metrics(), "the metrics")
+        wait_for(self._has_all_frames, "all frames, and no others")
 
     def _expected_metrics(self) -> dict[str, float]:
         return {
@@ -470,7 +475,7 @@ def test_hostile_images_are_refused_and_counted_by_all_who_read_them(
     target: Target, generator: random.Random, tally: Tally
 ) -> None:
     def send(kind: str, case: Case, readers: tuple[str, ...]) -> None:
-        target.camera.put(case.payload, attachment=case.attachment or target.next_header())
+        target.camera.put(case.payload, attachment=case.attachment)
         target.refused_images.update(readers)
         tally("image", kind)["live"] += 1
 
@@ -478,12 +483,14 @@ def test_hostile_images_are_refused_and_counted_by_all_who_read_them(
     for kind, make in hostile.IMAGE.kinds.items():
         for case in refused_cases(hostile.IMAGE, make, generator.randrange, LIVE_OF_A_KIND):
             send(kind, case, both)
-    send("oversized", Case(picture_message(hostile.PICTURE_BYTES + 1), None), both)
+    too_long = picture_message(hostile.PICTURE_BYTES + 1)
+    send("oversized", Case(too_long, None, hostile.image_header(2**31)), both)
     assert LIVE_OF_A_KIND * len(hostile.IMAGE.kinds) >= LIVE_CASES
     for number in range(LIVE_OF_A_KIND):
         # Sound in itself: only who has seen the frames before can tell.
         other_size = hostile.picture(".jpg", 64 + number, 48)
-        send("wrong shape", Case(hostile.image_message(other_size, "jpeg", 1 + number), None), both[:1])
+        message = hostile.image_message(other_size, "jpeg", 1 + number)
+        send("wrong shape", Case(message, None, target.next_header()), both[:1])
         target.recorded_images += 1
     sent = target.refused_images
     wait_for(lambda: target.counter(target.recorder, "refused_images") >= sent["recorder"], "the recorder's count")
@@ -520,7 +527,8 @@ def test_messages_to_another_session_change_nothing_in_this_one(
             JobClient(other).done(lease, Stream.SUBMAP, submap.record_id, submap, blobs, patience_s=0.0)
         camera = other.publisher(other.keys.image("front"), blocking=True, history=8)
         for _ in range(LIVE_OF_A_KIND):
-            camera.put(hostile.IMAGE.sound(generator.randrange).payload, attachment=target.next_header())
+            image = hostile.IMAGE.sound(generator.randrange)
+            camera.put(image.payload, attachment=image.attachment)
             tally("image", "unknown session")["live"] += 1
         target.show(5)
         target.is_unchanged()
