@@ -292,7 +292,7 @@ def test_power_loss_and_resume_from_the_crash_image(
     hook = {
         "PYTHONPATH": os.pathsep.join([str(HERE / "power_hook"), str(TESTS), os.environ.get("PYTHONPATH", "")]),
         power_loss.LOG_VARIABLE: str(file),
-        power_loss.CUT_VARIABLE: str(generator.randrange(20, 60 + 60 * number)),
+        power_loss.CUT_VARIABLE: str(generator.randrange(20, 60 + 30 * number)),
     }
     first = start(seconds_per_submap=1.0, environment=hook)
     cut = file.with_suffix(".cut")
