@@ -130,7 +130,7 @@ class Supervisor:
         _log.warning(
             "%s ended (%s), starting it again",
             command.label,
-            f"exit code {exit_code}" if exit_code >= 0 else f"killed by {signal.Signals(-exit_code).name}",
+            f"exit code {exit_code}" if exit_code >= 0 else f"signal {-exit_code}, {signal.strsignal(-exit_code)}",
             extra={"service": command.label, "exit_code": exit_code, "backoff_s": backoff, "last_words": words},
         )
 

@@ -240,6 +240,13 @@ def test_text_is_no_video(tmp_path: Path, text: str) -> None:
         open_source(str(path))
 
 
+def test_raw_video_whose_pixels_look_like_letters_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "grey.y4m"
+    frames = (b"FRAME\n" + b"P" * (128 * 96 * 3 // 2)) * 5
+    path.write_bytes(b"YUV4MPEG2 W128 H96 F25:1 Ip A1:1 C420jpeg\n" + frames)
+    assert len(list(open_source(str(path)).frames())) == 5
+
+
 def test_text_named_mp4_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mp4"
     path.write_text("hello")

@@ -181,13 +181,13 @@ def _open(path: Path) -> cv2.VideoCapture:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a file begins as text does, other than a playlist."""
+    """Whether a file begins as text does, other than a playlist or raw video, whose pixels may look like letters."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
-    if head.startswith((b"#EXTM3U", b"ffconcat")):
+    if head.startswith((b"#EXTM3U", b"ffconcat", b"YUV4MPEG2")):
         return False
     try:
         text = head.decode("utf-8")
