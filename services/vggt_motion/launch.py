@@ -25,7 +25,7 @@ from vggt_motion.errors import BusError, BusUnavailableError, InputError, VggtMo
 from vggt_motion.gateway.security import check_exposure
 from vggt_motion.inference.registry import choose_predictor
 from vggt_motion.ledger.sessions import SessionIdentity
-from vggt_motion.records import MotionState, Stream
+from vggt_motion.records import HealthReport, MotionState, Stream
 from vggt_motion.sources.registry import open_source
 from vggt_motion.sources.source import Source
 from vggt_motion.supervise import ServiceCommand, Supervisor
@@ -359,9 +359,7 @@ class LocalRun:
 
     def _missing_frame_count(self, state: LogState, watch: ServiceWatch) -> int:
         report = watch.newest_report("recorder")
-        if not self.config.recorder.enabled or report is None or state.stream_ended is None:
-            return 0
-        return max(0, int(state.stream_ended.detail["frame_count"]) - int(report.counters.get("frames", 0)))
+        return 0 if not self.config.recorder.enabled or report is None else _missing_frame_count(state, report)
 
     def _progress(self, state: LogState, watch: ServiceWatch) -> Progress:
         frontend, recorder = watch.newest_report("frontend"), watch.newest_report("recorder")
@@ -418,6 +416,13 @@ def _supervised(supervisor: Supervisor, bus: Bus) -> Iterator[None]:
         thread.join()
 
 
+def _missing_frame_count(state: LogState, recorder: HealthReport) -> int:
+    """Frames of the input that the recorder has not; 0 while the input has not ended."""
+    ended = state.stream_ended
+    wanted = int(ended.detail["frame_count"]) if ended is not None else 0
+    return max(0, wanted - int(recorder.counters.get("frames", 0)))
+
+
 class _RecorderProgress:
     """Whether the recorder has everything that it can have."""
 
@@ -443,9 +448,7 @@ class _RecorderProgress:
             self._frame_count, self._quiet_since = frame_count, now
         if any(report.counters.get(f"position_{stream.value}", 0) < position for stream, position in positions.items()):
             return False
-        ended = state.stream_ended
-        wanted = int(ended.detail["frame_count"]) if ended is not None else 0
-        if frame_count >= wanted:
+        if not _missing_frame_count(state, report):
             return True
         # Then those that are missing went by, and the results say how many.
         return now - self._quiet_since >= _RECORDER_QUIET_S

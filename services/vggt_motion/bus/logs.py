@@ -31,6 +31,11 @@ class StructuredFormatter(logging.Formatter):
         return line
 
 
+def is_told(count: int) -> bool:
+    """Whether the so many-th of events that may come without end is logged: the 1st, 2nd, 4th, 8th, ..."""
+    return count & (count - 1) == 0
+
+
 def set_up_logging(service: str, instance: str) -> None:
     """Send everything to standard error; the level is in the environment, INFO if it is not."""
     handler = logging.StreamHandler(sys.stderr)

@@ -22,6 +22,7 @@ from vggt_motion.bus import codec
 from vggt_motion.bus.images import ImageHeader, encode_image
 from vggt_motion.bus.jobs import one_line
 from vggt_motion.bus.ledger import append_request
+from vggt_motion.bus.logs import is_told
 from vggt_motion.bus.pubsub import Publisher
 from vggt_motion.bus.retry import retry
 from vggt_motion.bus.service import ServiceContext, run_service
@@ -340,7 +341,7 @@ class _Frontend:
 
     def _refuse(self, error: VggtMotionError) -> None:
         self._unreadable_count += 1
-        if self._unreadable_count & (self._unreadable_count - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
+        if is_told(self._unreadable_count):
             _log.warning("frame refused", extra={"count": self._unreadable_count, "reason": str(error)})
         self._report("working")
 

@@ -150,9 +150,9 @@ class BlobFiles:
         return "" if sha256_hex(data) == sha256 else "another content"
 
     def set_aside(self, sha256: str) -> None:
-        """Move a damaged file to ``damaged/``, where a person can look at it."""
+        """Move a file that is damaged, or of nobody, to ``damaged/``, where a person can look at it."""
         path = self._path(sha256)
-        _LOGGER.error("blob %s is damaged; moved to %s", sha256, self._damaged)
+        _LOGGER.error("blob %s is set aside in %s", sha256, self._damaged)
         with contextlib.suppress(OSError):
             make_folder(self._damaged, self._files)
             self._files.rename(path, self._damaged / sha256)
@@ -160,7 +160,7 @@ class BlobFiles:
     def keep_damaged(self, sha256: str, data: bytes) -> bool:
         """Write a content that was no file to ``damaged/`` as well; False: it cannot be written."""
         path = self._damaged / self._path(sha256).name
-        _LOGGER.error("blob %s is damaged; kept as %s", sha256, path)
+        _LOGGER.error("content %s is set aside as %s", sha256, path)
         with contextlib.suppress(OSError):
             make_folder(self._damaged, self._files)
             path.write_bytes(data)

@@ -15,6 +15,7 @@ from vggt_motion.bus import calls, codec
 from vggt_motion.bus.follow import SEVERAL_ENTRIES
 from vggt_motion.bus.jobs import many_lines, one_line
 from vggt_motion.bus.keys import last_chunk, service_of
+from vggt_motion.bus.logs import is_told
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.bus.serving import Handler
 from vggt_motion.bus.session import Bus, Closable
@@ -534,8 +535,8 @@ class Desk:
             self._refused_count += 1
             if isinstance(error, DiskFullError):
                 self._full_count += 1
-                if self._full_count & (self._full_count - 1):
-                    return  # the 1st, 2nd, 4th, 8th, ... is told: the log may lie on that disk
+                if not is_told(self._full_count):
+                    return  # the log may lie on that disk
         _log.warning("a request was refused", extra={"key": key, "reason": one_line(str(error))})
 
 

@@ -23,6 +23,7 @@ from vggt_motion.bus import codec
 from vggt_motion.bus.follow import Followed
 from vggt_motion.bus.images import decode_image
 from vggt_motion.bus.log import RECORD_OF_STREAM, LogFollower, LogRecord
+from vggt_motion.bus.logs import is_told
 from vggt_motion.bus.service import ServiceContext, run_service
 from vggt_motion.bus.session import Sample
 from vggt_motion.config import Config
@@ -188,7 +189,7 @@ class _Recorder:
                 self._payloads.put(frame_id, image.encoded)
         except CodecError as error:
             self._refused_images += 1
-            if self._refused_images & (self._refused_images - 1) == 0:  # the 1st, 2nd, 4th, 8th, ...
+            if is_told(self._refused_images):
                 _log.warning(
                     "image refused", extra={"key": sample.key, "count": self._refused_images, "reason": str(error)}
                 )

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 
 from vggt_motion.bus.images import ReceivedImage, decode_image
 from vggt_motion.bus.keys import Keys
+from vggt_motion.bus.logs import is_told
 from vggt_motion.bus.session import Bus, Sample, open_bus
 from vggt_motion.config import BusConfig, Config, load_config
 from vggt_motion.errors import BusError, CodecError, SourceError
@@ -140,7 +141,7 @@ class ZenohSource:
             image = decode_image(sample.payload, sample.attachment)
         except CodecError as error:
             self.refused_count += 1
-            if self.refused_count & (self.refused_count - 1) == 0:
+            if is_told(self.refused_count):
                 _log.warning(
                     "image refused", extra={"key": self._key, "count": self.refused_count, "reason": str(error)}
                 )

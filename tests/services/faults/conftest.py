@@ -31,9 +31,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     table = config.stash[_TABLE]
     if not table:
         return
-    write = terminalreporter.write_line
-    terminalreporter.section("faults")
-    write(f"seed {config.stash[_SEED]} (repeat with {SEED_VARIABLE})")
+    write = _section(terminalreporter, config, "faults")
     write(
         f"{'fault':<36}{'injected':>9}{'runs':>6}{'records':>9}{'lost':>6}{'twice':>7}{'jobs lost':>11}"
         f"{'jobs run twice':>16}{'equal':>7}"
@@ -61,13 +59,19 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     write(_line("all", total, "yes" if all(o.is_equal for outcomes in table.values() for o in outcomes) else "NO"))
 
 
+def _section(terminalreporter: Any, config: pytest.Config, name: str) -> Callable[[str], None]:
+    """Begin a part of the summary, with the seed that repeats it; returns what writes a line."""
+    terminalreporter.section(name)
+    terminalreporter.write_line(f"seed {config.stash[_SEED]} (repeat with {SEED_VARIABLE})")
+    write: Callable[[str], None] = terminalreporter.write_line
+    return write
+
+
 def _write_hostile(terminalreporter: Any, config: pytest.Config) -> None:
     table = config.stash[_HOSTILE]
     if not table:
         return
-    write = terminalreporter.write_line
-    terminalreporter.section("hostile bytes")
-    write(f"seed {config.stash[_SEED]} (repeat with {SEED_VARIABLE})")
+    write = _section(terminalreporter, config, "hostile bytes")
     columns = {
         "cases": "cases",
         "unparsed": "no message",
